@@ -1,0 +1,241 @@
+//! Every hyper-parameter, with its default and its reason.
+//!
+//! The defaults are NeuRodin's stage 1, outdoor-large (METHOD tables, "Configurations"); presets differ from them in a handful of
+//! fields. A `Config` is never written to after construction: what changes with time is computed by `train::schedule` from the step.
+
+use serde::{Deserialize, Serialize};
+
+/// All settings of a training run.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Config {
+    /// Name of the preset that this started from.
+    pub preset: String,
+    /// Seed of every random number: initial parameters, pixels, jitter, taps.
+    pub seed: u32,
+    /// Length of the run. The schedules below are written for `schedule_steps` and stretched to this.
+    pub steps: u64,
+    /// The number of steps that every schedule's own numbers refer to.
+    pub schedule_steps: u64,
+    /// Rays per training step.
+    pub rays: u32,
+    pub scene: SceneConfig,
+    pub hash: HashConfig,
+    pub surface: SurfaceConfig,
+    pub color: ColorConfig,
+    pub appearance: AppearanceConfig,
+    pub sampling: SamplingConfig,
+    pub background: BackgroundConfig,
+    pub loss: LossConfig,
+    pub optimizer: OptimizerConfig,
+}
+
+/// How the dataset is read, and the region that the surface may occupy.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SceneConfig {
+    /// "sphere", "box" or "auto" (sphere outdoors, box indoors).
+    pub shape: RegionKind,
+    /// The estimated (or given) region is enlarged by this factor.
+    pub region_scale: f64,
+    /// Every n-th view is held out where the dataset has no split of its own; 0 keeps all.
+    pub holdout: u32,
+    /// Images are reduced by this factor.
+    pub downscale: f64,
+    /// What a mask or alpha channel means.
+    pub masks: MaskUse,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum RegionKind {
+    Sphere,
+    Box,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum MaskUse {
+    /// Masks are not looked at (every NeuRodin recipe).
+    Ignore,
+    /// Masked-out pixels carry no loss.
+    Exclude,
+}
+
+/// The SDF's multi-resolution hash grid.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct HashConfig {
+    pub levels: u32,
+    /// Coarsest and finest resolution per axis of the region's cube [-1, 1]³.
+    pub base: u32,
+    pub max: u32,
+    /// Entries of a hashed level: 2^log2_size.
+    pub log2_size: u32,
+    /// Features per level: 1, 2, 4 or 8.
+    pub features: u32,
+}
+
+/// The SDF network: one hidden softplus layer, heads for SDF, scale logit and geometry features.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SurfaceConfig {
+    pub hidden: u32,
+    /// Geometry features handed to the colour network.
+    pub features: u32,
+    /// Mirrors the geometric initialisation: free space inside the initial sphere (indoor scenes).
+    pub inside_out: bool,
+    /// Radius-like bias of the geometric initialisation.
+    pub init_bias: f64,
+    /// Range of the local scale β = scale_max·sigmoid(v) + scale_floor.
+    pub scale_max: f64,
+    /// Floor of the local scale.
+    pub scale_floor: f64,
+    /// Taps lie U(0, tap_range) away, floored at a quarter of the finest cell.
+    pub tap_range: f64,
+}
+
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ColorConfig {
+    pub hidden: u32,
+    /// Hidden layers.
+    pub layers: u32,
+}
+
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct AppearanceConfig {
+    /// Length of the per-image code; 0 switches it off.
+    pub dims: u32,
+    /// The code used when rendering: zero (published), mean of all, or that of the frame.
+    pub at_eval: AppearanceAtEval,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum AppearanceAtEval {
+    Zero,
+    Mean,
+    Frame,
+}
+
+/// Proposal networks and sample counts.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SamplingConfig {
+    /// Samples of the two proposal levels.
+    pub proposal_samples: [u32; 2],
+    /// Shading samples.
+    pub samples: u32,
+    pub proposal_levels: u32,
+    pub proposal_base: u32,
+    pub proposal_max: [u32; 2],
+    pub proposal_log2_size: u32,
+    pub proposal_features: u32,
+    pub proposal_hidden: u32,
+    /// Schedule steps over which the proposal weights' exponent rises to 1.
+    pub anneal_steps: u64,
+}
+
+/// What a ray sees behind the region.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct BackgroundConfig {
+    pub kind: BackgroundKind,
+    /// Samples per ray between the region's border and `far`.
+    pub samples: u32,
+    pub far: f64,
+    pub levels: u32,
+    pub base: u32,
+    pub max: u32,
+    pub log2_size: u32,
+    pub features: u32,
+    pub hidden: u32,
+    /// Geometry features handed to the background's colour network.
+    pub geometry: u32,
+    /// Query in contracted coordinates; false restores the published wrap-around.
+    pub contraction: bool,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum BackgroundKind {
+    /// Nothing: black (closed rooms).
+    None,
+    /// One learned colour (an even sky).
+    Constant,
+    /// A learned radiance field (anything else outdoors).
+    Field,
+}
+
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LossConfig {
+    pub eikonal: f64,
+    pub interlevel: f64,
+    pub bias: BiasConfig,
+    /// Schedule A: lower bound of 1/β from `start` to `end`, logarithmic, over `steps` schedule steps.
+    pub scale_bound: ScaleBound,
+}
+
+/// Explicit bias correction (METHOD 4.3).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct BiasConfig {
+    pub weight: f64,
+    /// Ramp from `weight_start` to `weight` over `ramp_steps` (0: constant).
+    pub weight_start: f64,
+    pub ramp_steps: u64,
+    pub epsilon: f64,
+    /// Offset c of the point that must still be in free space.
+    pub offset: f64,
+    pub reduction: BiasReduction,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum BiasReduction {
+    PerRay,
+    Published,
+}
+
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ScaleBound {
+    pub start: f64,
+    pub end: f64,
+    pub steps: u64,
+}
+
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct OptimizerConfig {
+    pub fields: MultiStep,
+    pub table: MultiStep,
+    pub proposal: MultiStep,
+    pub background: Exponential,
+    pub beta1: f64,
+    pub beta2: f64,
+    pub epsilon: f64,
+}
+
+/// Linear warm-up, then a factor `gamma` at each milestone (schedule steps).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct MultiStep {
+    pub learning_rate: f64,
+    pub weight_decay: f64,
+    pub warmup: u64,
+    pub milestones: Vec<u64>,
+    pub gamma: f64,
+}
+
+/// Exponential decay from `learning_rate` to `learning_rate_end` over the schedule.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Exponential {
+    pub learning_rate: f64,
+    pub learning_rate_end: f64,
+    pub weight_decay: f64,
+}
