@@ -1,3 +1,4 @@
 //! Optimiser steps, their schedules, what is saved of them and what is told about them.
 
+pub mod checkpoint;
 pub mod schedule;
