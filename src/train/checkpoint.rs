@@ -63,6 +63,9 @@ impl Tensor {
     }
 }
 
+/// Where a save gets its numbers: the elements of a tensor in a range of indices.
+pub type Source<'s> = dyn FnMut(&Tensor, Range<u64>) -> Result<Vec<f32>> + 's;
+
 /// Writes `folder/step-XXXXXXXX.safetensors`, then removes what is beyond the newest `keep` of that folder.
 ///
 /// `read` returns elements of a tensor; it is called for every tensor in turn, for consecutive ranges of at most [`PIECE`].
@@ -75,7 +78,7 @@ pub fn save(
     keep: u32,
     state: &State,
     tensors: &[Tensor],
-    read: &mut dyn FnMut(&Tensor, Range<u64>) -> Result<Vec<f32>>,
+    read: &mut Source,
 ) -> Result<PathBuf> {
     let path = path_of(folder, state.step);
     let part = path.with_extension("safetensors.part");
@@ -266,7 +269,7 @@ fn write(
     file: &mut impl Write,
     header: &[u8],
     tensors: &[Tensor],
-    read: &mut dyn FnMut(&Tensor, Range<u64>) -> Result<Vec<f32>>,
+    read: &mut Source,
 ) -> Result<(), Failure> {
     file.write_all(header).map_err(Failure::Write)?;
     let mut checksums = vec![crc32fast::hash(header)];
