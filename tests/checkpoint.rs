@@ -116,7 +116,7 @@ fn large_tensors_pass_in_pieces() {
         folder.path(),
         2,
         &state(7),
-        &[tensor.clone()],
+        std::slice::from_ref(&tensor),
         &mut |_, range| {
             asked.push(range.clone());
             Ok(range.map(value).collect())

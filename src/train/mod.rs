@@ -1,4 +1,5 @@
 //! Optimiser steps, their schedules, what is saved of them and what is told about them.
 
 pub mod checkpoint;
+pub mod report;
 pub mod schedule;
