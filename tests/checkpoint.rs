@@ -1,6 +1,7 @@
 //! Checkpoints against everything that happens to files: truncation, flipped bits, full disks, and the process dying while it saves.
 
 use neurodin::config::Config;
+use neurodin::scene::{Region, RegionShape};
 use neurodin::train::checkpoint::{self, Checkpoint, PIECE, State, Tensor};
 use neurodin::{Error, Result};
 use proptest::prelude::*;
@@ -14,7 +15,12 @@ fn state(step: u64) -> State {
     State {
         step,
         config: Config::preset("outdoor-tiny").unwrap(),
-        region: serde_json::json!({ "center": [0.1, -2.5, 1e-30], "radius": 2.25 }),
+        region: Region {
+            center: glam::DVec3::new(0.1, -2.5, 1e-30),
+            radius: 2.25,
+            shape: RegionShape::Sphere,
+            how: "by hand".into(),
+        },
         extra: BTreeMap::from([("views".to_string(), "a.png\nb\u{fc}.png".to_string())]),
     }
 }

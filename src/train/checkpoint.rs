@@ -8,6 +8,7 @@
 //! Tensors pass through in pieces of [`PIECE`] numbers, so that a table of gigabytes needs no second copy of itself.
 
 use crate::config::Config;
+use crate::scene::Region;
 use crate::{Error, Result};
 use safetensors::Dtype;
 use std::collections::BTreeMap;
@@ -39,7 +40,7 @@ pub struct State {
     pub step: u64,
     pub config: Config,
     /// The region (normalisation) that the parameters refer to.
-    pub region: serde_json::Value,
+    pub region: Region,
     /// Anything else, by name.
     pub extra: BTreeMap<String, String>,
 }
@@ -238,7 +239,10 @@ fn header(state: &State, tensors: &[Tensor]) -> Vec<u8> {
             ("neurodin_version", env!("CARGO_PKG_VERSION").to_string()),
             ("step", state.step.to_string()),
             ("config", state.config.to_toml()),
-            ("region", state.region.to_string()),
+            (
+                "region",
+                serde_json::to_string(&state.region).expect("a region is plain data"),
+            ),
         ]
         .map(|(name, text)| (name.to_string(), text)),
     );

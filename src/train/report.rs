@@ -1,13 +1,8 @@
-//! What a run tells while it lasts, and where it keeps what it makes.
-//!
-//! The library prints nothing: everything that happens leaves as an [`Event`], whose receiver answers whether to go on. A run directory
-//! holds `config.toml`, `scene.json` (dataset, region, views), `log.jsonl` (events, one JSON object a line), `previews/` and `ckpt/`.
-
 use crate::{Error, Result};
 use serde_json::{Map, Value, json};
 use std::collections::VecDeque;
-use std::fs::{self, File, OpenOptions};
-use std::io::{ErrorKind, Read, Seek, SeekFrom, Write};
+use std::fs::{File, OpenOptions};
+use std::io::{Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
@@ -26,6 +21,7 @@ pub struct Losses {
     pub color: f64,
     pub eikonal: f64,
     pub bias: f64,
+    /// Both proposal levels.
     pub interlevel: f64,
 }
 
@@ -43,9 +39,9 @@ pub enum Event {
         test_views: usize,
         /// Learned numbers.
         parameters: u64,
-        /// Device memory in use from here to the end, bytes.
-        memory: u64,
     },
+    /// A step was handed to the device: sent for every one, so that its receiver can show progress and stop. Not logged.
+    Advanced { step: u64, steps: u64 },
     /// Training goes on from this checkpoint.
     Resumed { step: u64, path: PathBuf },
     /// Where training stands, every `report.log_steps`.
@@ -56,6 +52,8 @@ pub enum Event {
         losses: Losses,
         /// Of the batch, dB.
         psnr: f64,
+        /// Share of the rays that meet an opaque surface: pictures can be right while there is none.
+        crossing: f64,
         it_per_s: f64,
     },
     /// A picture of a held-out view was written.
@@ -82,6 +80,7 @@ impl Event {
     pub fn name(&self) -> &'static str {
         match self {
             Event::Started { .. } => "started",
+            Event::Advanced { .. } => "advanced",
             Event::Resumed { .. } => "resumed",
             Event::Step { .. } => "step",
             Event::Preview { .. } => "preview",
@@ -102,26 +101,28 @@ impl Event {
                 train_views,
                 test_views,
                 parameters,
-                memory,
             } => (
                 step,
                 json!({
                     "steps": steps, "device": device, "train_views": train_views, "test_views": test_views,
-                    "parameters": parameters, "mem.device": memory,
+                    "parameters": parameters,
                 }),
             ),
+            Event::Advanced { step, steps } => (step, json!({ "steps": steps })),
             Event::Resumed { step, path } => (step, json!({ "path": path })),
             Event::Step {
                 step,
                 steps,
                 losses,
                 psnr,
+                crossing,
                 it_per_s,
             } => (
                 step,
                 json!({
                     "steps": steps, "loss.total": losses.total, "loss.color": losses.color, "loss.eikonal": losses.eikonal,
-                    "loss.bias": losses.bias, "loss.interlevel": losses.interlevel, "psnr": psnr, "it_per_s": it_per_s,
+                    "loss.bias": losses.bias, "loss.interlevel": losses.interlevel, "psnr": psnr,
+                    "crossing": crossing, "it_per_s": it_per_s,
                 }),
             ),
             Event::Preview {
@@ -228,192 +229,6 @@ impl Pace {
     }
 }
 
-/// The folder of a run.
-#[derive(Debug)]
-pub struct RunDirectory {
-    root: PathBuf,
-    /// Held while a process writes here; the system lets go of it when the process ends, however it ends.
-    _lock: Option<File>,
-}
-
-impl RunDirectory {
-    /// Makes the folder for a new run. One that holds anything already is refused unless `replace`, which removes the parts of a
-    /// former run and nothing else.
-    ///
-    /// # Errors
-    /// [`Error::Output`] if it exists, is in use by another process, or cannot be written.
-    pub fn create(root: &Path, replace: bool) -> Result<RunDirectory> {
-        RunDirectory::check_free(root, replace)?;
-        let failed = |path: &Path, error: std::io::Error| {
-            Error::output(
-                path,
-                format!("cannot write there: {error}"),
-                "give another --out",
-            )
-        };
-        fs::create_dir_all(root).map_err(|error| failed(root, error))?;
-        let run = RunDirectory {
-            root: root.into(),
-            _lock: lock(root)?,
-        };
-        for file in [run.config(), run.scene(), run.log()] {
-            remove(&file, |path| fs::remove_file(path))?;
-        }
-        for folder in [run.previews(), run.checkpoints()] {
-            remove(&folder, |path| fs::remove_dir_all(path))?;
-            fs::create_dir_all(&folder).map_err(|error| failed(&folder, error))?;
-        }
-        Ok(run)
-    }
-
-    /// Whether [`RunDirectory::create`] would find the place free; changes nothing.
-    ///
-    /// # Errors
-    /// [`Error::Output`] if not.
-    pub fn check_free(root: &Path, replace: bool) -> Result<()> {
-        let holds_something = |mut entries: fs::ReadDir| {
-            entries.any(|entry| entry.is_ok_and(|entry| entry.file_name() != LOCK))
-        };
-        let empty = match fs::read_dir(root).map(|entries| !holds_something(entries)) {
-            Ok(empty) => empty,
-            Err(error) if error.kind() == ErrorKind::NotFound => true,
-            Err(error) => return Err(Error::output(root, error.to_string(), "give another --out")),
-        };
-        if empty || replace {
-            Ok(())
-        } else if root.join("config.toml").exists() {
-            Err(Error::output(
-                root,
-                "holds a run already",
-                "go on with it by --resume, replace it by --force, or give another --out",
-            ))
-        } else {
-            Err(Error::output(
-                root,
-                "exists and is not empty",
-                "give another --out, or --force to write into it",
-            ))
-        }
-    }
-
-    /// An existing run, to be gone on with.
-    ///
-    /// # Errors
-    /// As [`RunDirectory::open`]; [`Error::Output`] if another process is writing there.
-    pub fn resume(root: &Path) -> Result<RunDirectory> {
-        let run = RunDirectory::open(root)?;
-        Ok(RunDirectory {
-            _lock: lock(root)?,
-            ..run
-        })
-    }
-
-    /// An existing run, to be read.
-    ///
-    /// # Errors
-    /// [`Error::Input`] if there is none.
-    pub fn open(root: &Path) -> Result<RunDirectory> {
-        let run = RunDirectory {
-            root: root.into(),
-            _lock: None,
-        };
-        match run.config().is_file() {
-            true => Ok(run),
-            false => Err(Error::input(
-                root,
-                "is no run directory: it holds no config.toml",
-                "name the folder that `neurodin train --out` wrote",
-            )),
-        }
-    }
-
-    pub fn root(&self) -> &Path {
-        &self.root
-    }
-
-    /// The resolved configuration, commented.
-    pub fn config(&self) -> PathBuf {
-        self.root.join("config.toml")
-    }
-
-    /// Dataset, region and views.
-    pub fn scene(&self) -> PathBuf {
-        self.root.join("scene.json")
-    }
-
-    pub fn log(&self) -> PathBuf {
-        self.root.join("log.jsonl")
-    }
-
-    pub fn checkpoints(&self) -> PathBuf {
-        self.root.join("ckpt")
-    }
-
-    pub fn previews(&self) -> PathBuf {
-        self.root.join("previews")
-    }
-
-    /// The picture of a held-out view after so many steps.
-    pub fn preview(&self, step: u64) -> PathBuf {
-        self.previews().join(format!("step-{step:08}.png"))
-    }
-
-    /// Writes a small text file whole or not at all.
-    ///
-    /// # Errors
-    /// [`Error::Output`] if it cannot be written.
-    pub fn write(&self, path: &Path, text: &str) -> Result<()> {
-        let part = path.with_extension("part");
-        let written = File::create(&part).and_then(|mut file| {
-            file.write_all(text.as_bytes())?;
-            file.sync_all()?;
-            fs::rename(&part, path)
-        });
-        written.map_err(|error| {
-            Error::output(
-                path,
-                format!("cannot be written: {error}"),
-                "make room or mend the permissions there",
-            )
-        })
-    }
-}
-
-fn remove(path: &Path, remove: impl Fn(&Path) -> std::io::Result<()>) -> Result<()> {
-    match remove(path) {
-        Err(error) if error.kind() != ErrorKind::NotFound => Err(Error::output(
-            path,
-            format!("cannot be replaced: {error}"),
-            "give another --out",
-        )),
-        _ => Ok(()),
-    }
-}
-
-/// Name of the file whose lock says that a process writes to a run.
-const LOCK: &str = ".lock";
-
-/// Takes the folder for this process. File systems without locks go without.
-fn lock(root: &Path) -> Result<Option<File>> {
-    let path = root.join(LOCK);
-    let file = File::create(&path).map_err(|error| {
-        Error::output(
-            root,
-            format!("cannot write there: {error}"),
-            "mend the permissions",
-        )
-    })?;
-    match file.try_lock() {
-        Ok(()) => Ok(Some(file)),
-        Err(fs::TryLockError::WouldBlock) => Err(Error::output(
-            root,
-            "another process is training there",
-            "wait for it or stop it, or give another --out",
-        )),
-        Err(fs::TryLockError::Error(_)) => Ok(None),
-    }
-}
-
 /// The log of a run: events, one JSON object a line.
 #[derive(Debug)]
 pub struct Log {
@@ -448,11 +263,14 @@ impl Log {
         })
     }
 
-    /// Appends an event.
+    /// Appends an event, except [`Event::Advanced`].
     ///
     /// # Errors
     /// [`Error::Output`] if it cannot be written.
     pub fn write(&mut self, event: &Event) -> Result<()> {
+        if matches!(event, Event::Advanced { .. }) {
+            return Ok(());
+        }
         let mut line = serde_json::to_vec(&event.record()).expect("a record is plain data");
         line.push(b'\n');
         // One write for one line: whoever reads along never sees half of it.
@@ -473,6 +291,7 @@ fn cannot_log(path: &Path, error: std::io::Error) -> Error {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::fs;
 
     #[test]
     fn timestamps() {
@@ -518,6 +337,7 @@ mod tests {
                 ..Losses::default()
             },
             psnr: 20.5,
+            crossing: 0.5,
             it_per_s: 3.0,
         };
         let record = event.record();
@@ -561,38 +381,5 @@ mod tests {
             .lines()
             .filter(|line| serde_json::from_str::<Value>(line).is_ok());
         assert_eq!(whole.count(), 2, "{text}");
-    }
-
-    #[test]
-    fn a_run_is_neither_overwritten_nor_shared() {
-        let folder = tempfile::tempdir().unwrap();
-        let root = folder.path().join("run");
-        assert!(
-            RunDirectory::open(&root)
-                .unwrap_err()
-                .to_string()
-                .contains("no run directory")
-        );
-        let run = RunDirectory::create(&root, false).unwrap();
-        run.write(&run.config(), "steps = 1\n").unwrap();
-        fs::write(run.preview(5), b"png").unwrap();
-        fs::write(root.join("notes.txt"), b"mine").unwrap();
-        assert!(matches!(
-            RunDirectory::create(&root, false),
-            Err(Error::Output { .. })
-        ));
-        let shared = RunDirectory::resume(&root).unwrap_err().to_string();
-        assert!(shared.contains("another process"), "{shared}");
-        let shared = RunDirectory::create(&root, true).unwrap_err().to_string();
-        assert!(shared.contains("another process"), "{shared}");
-        assert!(run.preview(5).exists(), "nothing was removed");
-        drop(run);
-        drop(RunDirectory::resume(&root).unwrap());
-        let run = RunDirectory::create(&root, true).unwrap();
-        assert!(!run.preview(5).exists() && !run.config().exists());
-        assert!(
-            root.join("notes.txt").exists(),
-            "what is not of a run stays"
-        );
     }
 }
