@@ -224,16 +224,10 @@ impl<'a> Document<'a> {
             let matrix = entry
                 .get("transform_matrix")
                 .ok_or_else(|| self.error(format!("{place}has no transform_matrix")))?;
-            let mask = match entry.get("mask_path").and_then(Value::as_str) {
-                Some(mask) => Some(find(root, mask, &[]).map_err(|why| {
-                    Error::input(
-                        self.file,
-                        format!("{place}its mask: {why}"),
-                        "put the mask there, or take mask_path out of the frame",
-                    )
-                })?),
-                None => None,
-            };
+            let mask = entry
+                .get("mask_path")
+                .and_then(Value::as_str)
+                .map(|mask| find(root, mask, &[]));
             frames.push(Frame {
                 image: find(root, path, &ENDINGS),
                 mask,
