@@ -1,1 +1,3 @@
-//! Module train.
+//! Optimiser steps, their schedules, what is saved of them and what is told about them.
+
+pub mod schedule;
