@@ -1,1 +1,3 @@
 //! Module scene.
+
+pub mod synthetic;
