@@ -41,8 +41,8 @@ vec2 camera_newton_step(vec2 w, vec2 target, vec4 numerator, vec3 denominator, v
     float yy = rho + 2.0 * y * y * d_rho + 2.0 * p2 * x + 6.0 * p1 * y + 2.0 * prism.y * y;
     float det = xx * yy - xy * yx;
     if (abs(det) < 1e-6) return vec2(0.0);
-    vec2 step = vec2(yy * error.x - xy * error.y, xx * error.y - yx * error.x) / det;
-    return step * min(1.0, 0.5 * (1.0 + length(w)) / max(length(step), 1e-30));
+    vec2 move = vec2(yy * error.x - xy * error.y, xx * error.y - yx * error.x) / det;
+    return move * min(1.0, 0.5 * (1.0 + length(w)) / max(length(move), 1e-30));
 }
 
 // Direction in the OpenGL camera frame (x right, y up, looking along -z): z = -1 for perspective models, unit for fisheye models.

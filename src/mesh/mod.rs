@@ -5,6 +5,7 @@
 
 pub mod clean;
 pub mod extract;
+pub mod field;
 pub mod marching_cubes;
 pub mod write;
 
@@ -13,6 +14,7 @@ use glam::DVec3;
 pub use extract::{
     Domain, ExtractOptions, ExtractStats, Lattice, Progress, SurfaceAttributes, extract_mesh,
 };
+pub use field::Field;
 pub use write::{MeshFormat, write_mesh};
 
 /// Triangles with optional normals and colours per vertex. Without faces it is a point cloud.

@@ -356,6 +356,11 @@ impl Surface {
         b.shading.ptr().offset(u64::from(b.n))
     }
 
+    /// Element of `shading` at which the gradient's three rows begin.
+    pub fn gradient_row(&self, b: &SurfaceBuffers) -> u64 {
+        u64::from(1 + self.geometry) * u64::from(b.n)
+    }
+
     /// Where row 0 of the shading gradients, the scale logit's, is to be written.
     pub fn d_logit(&self, b: &SurfaceBuffers) -> PtrMut<f32> {
         b.d_shading.ptr_mut()
