@@ -20,9 +20,17 @@ pub struct Device {
 pub fn device() -> &'static Device {
     static DEVICE: OnceLock<Device> = OnceLock::new();
     DEVICE.get_or_init(|| {
-        let options = GpuOptions { validation: true, guard: true, ..GpuOptions::default() };
+        let options = GpuOptions {
+            validation: true,
+            guard: true,
+            ..GpuOptions::default()
+        };
         let gpu = Gpu::new(&options).expect("kernel tests need a Vulkan device");
-        eprintln!("kernel tests on {} ({})", gpu.info().name, gpu.info().driver);
+        eprintln!(
+            "kernel tests on {} ({})",
+            gpu.info().name,
+            gpu.info().driver
+        );
         Device { gpu }
     })
 }
@@ -31,13 +39,19 @@ impl Device {
     /// Numbers on the device, rounded to float32. Round them in the test too ([`rounded`]) before a twin sees them.
     pub fn put(&self, name: &str, values: &[f64]) -> Buffer<f32> {
         let values: Vec<f32> = values.iter().map(|&x| x as f32).collect();
-        let buffer = self.gpu.buffer(name, values.len() as u64).expect("a small buffer");
+        let buffer = self
+            .gpu
+            .buffer(name, values.len() as u64)
+            .expect("a small buffer");
         self.gpu.upload(&buffer, 0, &values).expect("upload");
         buffer
     }
 
     pub fn put_uints(&self, name: &str, values: &[u32]) -> Buffer<u32> {
-        let buffer = self.gpu.buffer(name, values.len() as u64).expect("a small buffer");
+        let buffer = self
+            .gpu
+            .buffer(name, values.len() as u64)
+            .expect("a small buffer");
         self.gpu.upload(&buffer, 0, values).expect("upload");
         buffer
     }
@@ -62,12 +76,17 @@ impl Device {
     }
 
     pub fn take(&self, buffer: &Buffer<f32>) -> Vec<f64> {
-        let values = self.gpu.download(buffer, 0, buffer.len()).expect("download");
+        let values = self
+            .gpu
+            .download(buffer, 0, buffer.len())
+            .expect("download");
         values.into_iter().map(f64::from).collect()
     }
 
     pub fn take_uints(&self, buffer: &Buffer<u32>) -> Vec<u32> {
-        self.gpu.download(buffer, 0, buffer.len()).expect("download")
+        self.gpu
+            .download(buffer, 0, buffer.len())
+            .expect("download")
     }
 }
 
@@ -76,7 +95,10 @@ pub fn golden(name: &str) -> Option<Npz> {
     let default = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../shared/golden");
     let folder = std::env::var_os("NEURODIN_GOLDEN").map_or(default, PathBuf::from);
     if !folder.is_dir() {
-        println!("skipped: no golden arrays in {} (set NEURODIN_GOLDEN)", folder.display());
+        println!(
+            "skipped: no golden arrays in {} (set NEURODIN_GOLDEN)",
+            folder.display()
+        );
         return None;
     }
     Some(Npz::open(&folder.join(format!("{name}.npz"))))
@@ -89,13 +111,17 @@ pub fn rounded(values: impl IntoIterator<Item = f64>) -> Vec<f64> {
 
 /// Planar from interleaved: `[n, C]` to `[C, n]`.
 pub fn planar<const C: usize>(vectors: &[[f64; C]]) -> Vec<f64> {
-    (0..C).flat_map(|c| vectors.iter().map(move |v| v[c])).collect()
+    (0..C)
+        .flat_map(|c| vectors.iter().map(move |v| v[c]))
+        .collect()
 }
 
 /// Interleaved from planar: `[C, n]` to `[n, C]`.
 pub fn interleaved<const C: usize>(planes: &[f64]) -> Vec<[f64; C]> {
     let n = planes.len() / C;
-    (0..n).map(|i| std::array::from_fn(|c| planes[c * n + i])).collect()
+    (0..n)
+        .map(|i| std::array::from_fn(|c| planes[c * n + i]))
+        .collect()
 }
 
 fn compare(what: &str, got: &[f64], want: &[f64]) -> (f64, f64, f64) {
@@ -106,7 +132,11 @@ fn compare(what: &str, got: &[f64], want: &[f64]) -> (f64, f64, f64) {
     }
     let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
     let error: f64 = got.iter().zip(want).map(|(a, b)| (a - b).powi(2)).sum();
-    (error, dot(want, want), dot(got, want) / (dot(got, got) * dot(want, want)).sqrt())
+    (
+        error,
+        dot(want, want),
+        dot(got, want) / (dot(got, got) * dot(want, want)).sqrt(),
+    )
 }
 
 /// Normalised mean squared error of at most 1e-7: the bar for everything computed forward.
@@ -122,22 +152,39 @@ pub fn assert_forward(what: &str, got: &[f64], want: &[f64]) {
 pub fn assert_gradient(what: &str, got: &[f64], want: &[f64]) {
     let (error, power, cosine) = compare(what, got, want);
     let distance = (error / power).sqrt();
-    assert!(distance <= 1e-4 && cosine >= 0.99999, "{what}: relative L2 {distance:e}, cosine {cosine}");
+    assert!(
+        distance <= 1e-4 && cosine >= 0.99999,
+        "{what}: relative L2 {distance:e}, cosine {cosine}"
+    );
 }
 
 /// Every element within an absolute tolerance.
 #[track_caller]
 pub fn assert_close(what: &str, got: &[f64], want: &[f64], tolerance: f64) {
     compare(what, got, want);
-    let worst = (0..got.len()).max_by(|&a, &b| (got[a] - want[a]).abs().total_cmp(&(got[b] - want[b]).abs()));
+    let worst = (0..got.len()).max_by(|&a, &b| {
+        (got[a] - want[a])
+            .abs()
+            .total_cmp(&(got[b] - want[b]).abs())
+    });
     let i = worst.expect("not empty");
     let error = (got[i] - want[i]).abs();
-    assert!(error <= tolerance, "{what}: element {i} is {}, wanted {}, {error:e} apart", got[i], want[i]);
+    assert!(
+        error <= tolerance,
+        "{what}: element {i} is {}, wanted {}, {error:e} apart",
+        got[i],
+        want[i]
+    );
 }
 
 /// An analytic gradient against central differences with steps of 1e-6 (atol 1e-5, rtol 1e-3).
 #[track_caller]
-pub fn assert_central_differences(what: &str, at: &[f64], gradient: &[f64], value: impl Fn(&[f64]) -> f64) {
+pub fn assert_central_differences(
+    what: &str,
+    at: &[f64],
+    gradient: &[f64],
+    value: impl Fn(&[f64]) -> f64,
+) {
     let step = 1e-6;
     for i in 0..at.len() {
         let moved = |by: f64| {
@@ -148,7 +195,11 @@ pub fn assert_central_differences(what: &str, at: &[f64], gradient: &[f64], valu
         let difference = (moved(step) - moved(-step)) / (2.0 * step);
         let tolerance = 1e-5 + 1e-3 * difference.abs();
         let error = (gradient[i] - difference).abs();
-        assert!(error <= tolerance, "{what}: element {i}: analytic {}, difference {difference}", gradient[i]);
+        assert!(
+            error <= tolerance,
+            "{what}: element {i}: analytic {}, difference {difference}",
+            gradient[i]
+        );
     }
 }
 
@@ -200,4 +251,3 @@ pub fn uneven_edges(random: &mut Random, n: usize) -> Vec<f64> {
     }));
     rounded(edges)
 }
-
