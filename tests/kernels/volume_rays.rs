@@ -152,7 +152,11 @@ fn look_along(direction: [f64; 3], origin: [f64; 3], turn: f64) -> [f64; 12] {
 /// One camera of every model with a plausible lens, all but a few near the region, pictures of different sizes.
 fn pictures(random: &mut Random) -> Vec<Picture> {
     let lens = |model: CameraModel, w: f64, h: f64| -> Vec<f64> {
-        let focal = if model.is_fisheye() { 0.5 * w } else { 0.9 * w };
+        let focal = if model.is_fisheye() {
+            0.5 * w.max(h)
+        } else {
+            0.9 * w.max(h)
+        };
         let focals = if model.has_single_focal() {
             vec![focal]
         } else {
