@@ -1,1 +1,3 @@
 //! Module cli.
+
+pub mod demo;
