@@ -251,7 +251,7 @@ pub const fn stick_axis(index: usize) -> (DVec3, DVec3, f64) {
         [0.9272, -0.3746],
     ];
     let [x, y] = AROUND[index];
-    let lean = if index % 2 == 0 { 0.88 } else { 1.06 };
+    let lean = if index.is_multiple_of(2) { 0.88 } else { 1.06 };
     let part = index as f64 / (STICKS - 1) as f64;
     let height = 0.60 - 0.24 * part;
     (
