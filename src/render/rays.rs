@@ -37,7 +37,9 @@ impl ViewTable {
             counts.push(rgba.len() as f64);
             pixels.push(buffer);
         }
-        let none = pixels.first().map_or(bytemuck::Zeroable::zeroed(), Buffer::ptr);
+        let none = pixels
+            .first()
+            .map_or(bytemuck::Zeroable::zeroed(), Buffer::ptr);
         rows.extend(others.map(|(camera, pose)| view_row(region, camera, pose, none)));
         let total: f64 = counts.iter().sum();
         let mut sum = 0.0;

@@ -110,7 +110,9 @@ impl CameraModel {
     pub fn param_count(self) -> usize {
         match self {
             CameraModel::SimplePinhole => 3,
-            CameraModel::Pinhole | CameraModel::SimpleRadial | CameraModel::SimpleRadialFisheye => 4,
+            CameraModel::Pinhole | CameraModel::SimpleRadial | CameraModel::SimpleRadialFisheye => {
+                4
+            }
             CameraModel::Radial | CameraModel::Fov | CameraModel::RadialFisheye => 5,
             CameraModel::Opencv | CameraModel::OpencvFisheye => 8,
             CameraModel::FullOpencv | CameraModel::ThinPrismFisheye => 12,
@@ -160,19 +162,34 @@ pub struct Camera {
 
 impl Camera {
     /// A camera whose numbers make sense, or what is wrong with them.
-    pub fn new(model: CameraModel, width: u32, height: u32, params: Vec<f64>) -> Result<Self, String> {
+    pub fn new(
+        model: CameraModel,
+        width: u32,
+        height: u32,
+        params: Vec<f64>,
+    ) -> Result<Self, String> {
         if params.len() != model.param_count() {
-            return Err(format!("camera model {model} takes {} parameters, not {}", model.param_count(), params.len()));
+            return Err(format!(
+                "camera model {model} takes {} parameters, not {}",
+                model.param_count(),
+                params.len()
+            ));
         }
         if let Some(bad) = params.iter().find(|value| !value.is_finite()) {
-            return Err(format!("camera parameter {bad} of a {model} camera is not finite"));
+            return Err(format!(
+                "camera parameter {bad} of a {model} camera is not finite"
+            ));
         }
         let focals = if model.has_single_focal() { 1 } else { 2 };
         if let Some(bad) = params[..focals].iter().find(|focal| **focal <= 0.0) {
-            return Err(format!("focal length {bad} of a {model} camera is not positive"));
+            return Err(format!(
+                "focal length {bad} of a {model} camera is not positive"
+            ));
         }
         if width == 0 || height == 0 || width > 1 << 17 || height > 1 << 17 {
-            return Err(format!("image size {width}x{height} is not between 1 and 131072 pixels a side"));
+            return Err(format!(
+                "image size {width}x{height} is not between 1 and 131072 pixels a side"
+            ));
         }
         Ok(Camera {
             model,
@@ -240,7 +257,10 @@ impl Camera {
 
     /// Whether `pixel` lies within the image.
     pub fn contains(&self, pixel: DVec2) -> bool {
-        pixel.x >= 0.0 && pixel.y >= 0.0 && pixel.x < f64::from(self.width) && pixel.y < f64::from(self.height)
+        pixel.x >= 0.0
+            && pixel.y >= 0.0
+            && pixel.x < f64::from(self.width)
+            && pixel.y < f64::from(self.height)
     }
 
     /// The same lens over an image of `width` by `height` pixels.
@@ -257,7 +277,12 @@ impl Camera {
             params[..3].iter_mut().for_each(|length| *length *= scale.x);
             (self.model, params)
         } else if self.model.has_single_focal() {
-            let mut params = vec![old[0] * scale.x, old[0] * scale.y, old[1] * scale.x, old[2] * scale.y];
+            let mut params = vec![
+                old[0] * scale.x,
+                old[0] * scale.y,
+                old[1] * scale.x,
+                old[2] * scale.y,
+            ];
             let radial = |index: usize| old.get(index).copied().unwrap_or(0.0);
             let model = match self.model {
                 CameraModel::SimplePinhole => CameraModel::Pinhole,
@@ -296,10 +321,15 @@ impl Camera {
     /// Half the smaller angle of view, in radians: from the axis to the middle of the nearest edge.
     pub fn half_angle(&self) -> f64 {
         let (w, h, c) = (f64::from(self.width), f64::from(self.height), self.center());
-        [DVec2::new(0.0, c.y), DVec2::new(w, c.y), DVec2::new(c.x, 0.0), DVec2::new(c.x, h)]
-            .into_iter()
-            .map(|edge| self.direction(edge).angle_between(DVec3::NEG_Z))
-            .fold(f64::INFINITY, f64::min)
+        [
+            DVec2::new(0.0, c.y),
+            DVec2::new(w, c.y),
+            DVec2::new(c.x, 0.0),
+            DVec2::new(c.x, h),
+        ]
+        .into_iter()
+        .map(|edge| self.direction(edge).angle_between(DVec3::NEG_Z))
+        .fold(f64::INFINITY, f64::min)
     }
 
     fn lens(&self) -> Lens {
@@ -312,8 +342,12 @@ impl Camera {
         lens.fisheye = self.model.is_fisheye();
         match self.model {
             CameraModel::SimplePinhole | CameraModel::Pinhole => {}
-            CameraModel::SimpleRadial | CameraModel::SimpleRadialFisheye => lens.numerator[0] = p[3],
-            CameraModel::Radial | CameraModel::RadialFisheye => lens.numerator[..2].copy_from_slice(&p[3..5]),
+            CameraModel::SimpleRadial | CameraModel::SimpleRadialFisheye => {
+                lens.numerator[0] = p[3]
+            }
+            CameraModel::Radial | CameraModel::RadialFisheye => {
+                lens.numerator[..2].copy_from_slice(&p[3..5])
+            }
             CameraModel::Opencv => {
                 lens.numerator[..2].copy_from_slice(&p[4..6]);
                 lens.tangential = DVec2::new(p[6], p[7]);
@@ -382,7 +416,10 @@ impl Lens {
         let d_top = k1 + s * (2.0 * k2 + s * (3.0 * k3 + s * 4.0 * k4));
         let bottom = 1.0 + s * (k5 + s * (k6 + s * k7));
         let d_bottom = k5 + s * (2.0 * k6 + s * 3.0 * k7);
-        (top / bottom, (d_top * bottom - top * d_bottom) / (bottom * bottom))
+        (
+            top / bottom,
+            (d_top * bottom - top * d_bottom) / (bottom * bottom),
+        )
     }
 
     fn distort(&self, w: DVec2) -> DVec2 {
@@ -485,15 +522,21 @@ mod tests {
             CameraModel::SimpleRadial => vec![500.0, 322.0, 239.0, -0.12],
             CameraModel::Radial => vec![500.0, 322.0, 239.0, -0.2, 0.06],
             CameraModel::Opencv => vec![500.0, 510.0, 322.0, 239.0, -0.2, 0.06, 1e-3, -2e-3],
-            CameraModel::OpencvFisheye => vec![300.0, 302.0, 322.0, 239.0, 0.04, -0.01, 4e-3, -1e-3],
+            CameraModel::OpencvFisheye => {
+                vec![300.0, 302.0, 322.0, 239.0, 0.04, -0.01, 4e-3, -1e-3]
+            }
             CameraModel::FullOpencv => {
-                vec![500.0, 510.0, 322.0, 239.0, 0.3, 0.05, 1e-3, -2e-3, 0.01, 0.5, 0.1, 0.01]
+                vec![
+                    500.0, 510.0, 322.0, 239.0, 0.3, 0.05, 1e-3, -2e-3, 0.01, 0.5, 0.1, 0.01,
+                ]
             }
             CameraModel::Fov => vec![400.0, 405.0, 322.0, 239.0, 0.9],
             CameraModel::SimpleRadialFisheye => vec![300.0, 322.0, 239.0, -0.02],
             CameraModel::RadialFisheye => vec![300.0, 322.0, 239.0, -0.02, 3e-3],
             CameraModel::ThinPrismFisheye => {
-                vec![300.0, 302.0, 322.0, 239.0, 0.04, -0.01, 1e-3, -1e-3, 4e-3, -1e-3, 2e-3, -1e-3]
+                vec![
+                    300.0, 302.0, 322.0, 239.0, 0.04, -0.01, 1e-3, -1e-3, 4e-3, -1e-3, 2e-3, -1e-3,
+                ]
             }
         };
         CameraModel::ALL
@@ -503,7 +546,9 @@ mod tests {
     }
 
     fn pixels() -> impl Iterator<Item = DVec2> {
-        (0..=16).flat_map(|row| (0..=16).map(move |column| DVec2::new(f64::from(column) * 40.0, f64::from(row) * 30.0)))
+        (0..=16).flat_map(|row| {
+            (0..=16).map(move |column| DVec2::new(f64::from(column) * 40.0, f64::from(row) * 30.0))
+        })
     }
 
     #[test]
@@ -511,8 +556,14 @@ mod tests {
         for camera in cameras() {
             for pixel in pixels() {
                 let direction = camera.direction(pixel);
-                let back = camera.project(direction * 3.7).unwrap_or_else(|| panic!("{} {pixel}", camera.model));
-                assert!((back - pixel).length() <= 1e-6, "{} {pixel} came back as {back}", camera.model);
+                let back = camera
+                    .project(direction * 3.7)
+                    .unwrap_or_else(|| panic!("{} {pixel}", camera.model));
+                assert!(
+                    (back - pixel).length() <= 1e-6,
+                    "{} {pixel} came back as {back}",
+                    camera.model
+                );
             }
         }
     }
@@ -522,8 +573,14 @@ mod tests {
         for camera in cameras() {
             for pixel in pixels() {
                 let direction = camera.direction(pixel).normalize();
-                let again = camera.direction(camera.project(direction).unwrap()).normalize();
-                assert!((again - direction).length() <= 1e-9, "{} {pixel}", camera.model);
+                let again = camera
+                    .direction(camera.project(direction).unwrap())
+                    .normalize();
+                assert!(
+                    (again - direction).length() <= 1e-9,
+                    "{} {pixel}",
+                    camera.model
+                );
             }
         }
     }
@@ -545,7 +602,8 @@ mod tests {
             };
             let fisheye = |k: [f64; 4]| {
                 let t2 = theta * theta;
-                let d = theta * (1.0 + k[0] * t2 + k[1] * t2.powi(2) + k[2] * t2.powi(3) + k[3] * t2.powi(4));
+                let d = theta
+                    * (1.0 + k[0] * t2 + k[1] * t2.powi(2) + k[2] * t2.powi(3) + k[3] * t2.powi(4));
                 (x * d / r, y * d / r)
             };
             let (u, v) = match camera.model {
@@ -571,10 +629,17 @@ mod tests {
                 CameraModel::ThinPrismFisheye => {
                     let (x, y) = (theta * x / r, theta * y / r);
                     let r2 = x * x + y * y;
-                    let radial = p[4] * r2 + p[5] * r2.powi(2) + p[8] * r2.powi(3) + p[9] * r2.powi(4);
+                    let radial =
+                        p[4] * r2 + p[5] * r2.powi(2) + p[8] * r2.powi(3) + p[9] * r2.powi(4);
                     (
-                        x + x * radial + 2.0 * p[6] * x * y + p[7] * (r2 + 2.0 * x * x) + p[10] * r2,
-                        y + y * radial + 2.0 * p[7] * x * y + p[6] * (r2 + 2.0 * y * y) + p[11] * r2,
+                        x + x * radial
+                            + 2.0 * p[6] * x * y
+                            + p[7] * (r2 + 2.0 * x * x)
+                            + p[10] * r2,
+                        y + y * radial
+                            + 2.0 * p[7] * x * y
+                            + p[6] * (r2 + 2.0 * y * y)
+                            + p[11] * r2,
                     )
                 }
             };
@@ -585,7 +650,11 @@ mod tests {
             };
             let wanted = DVec2::new(fx * u + cx, fy * v + cy);
             let got = camera.project(point * 2.0).unwrap();
-            assert!((got - wanted).length() < 1e-9, "{}: {got} instead of {wanted}", camera.model);
+            assert!(
+                (got - wanted).length() < 1e-9,
+                "{}: {got} instead of {wanted}",
+                camera.model
+            );
         }
     }
 
@@ -598,7 +667,11 @@ mod tests {
                 let scale = DVec2::new(f64::from(width) / 640.0, f64::from(height) / 480.0);
                 for pixel in pixels() {
                     let difference = small.direction(pixel * scale) - camera.direction(pixel);
-                    assert!(difference.length() < 1e-9, "{} to {width}x{height}", camera.model);
+                    assert!(
+                        difference.length() < 1e-9,
+                        "{} to {width}x{height}",
+                        camera.model
+                    );
                 }
             }
         }
@@ -607,7 +680,13 @@ mod tests {
     #[test]
     fn beyond_the_fold_nothing_is_seen_and_nothing_breaks() {
         // x - 0.3 x³ turns at x = 1.054: directions further out would come back into the picture.
-        let camera = Camera::new(CameraModel::SimpleRadial, 640, 480, vec![300.0, 320.0, 240.0, -0.3]).unwrap();
+        let camera = Camera::new(
+            CameraModel::SimpleRadial,
+            640,
+            480,
+            vec![300.0, 320.0, 240.0, -0.3],
+        )
+        .unwrap();
         assert!(camera.project(DVec3::new(1.0, 0.0, -1.0)).is_some());
         assert!(camera.project(DVec3::new(1.2, 0.0, -1.0)).is_none());
         assert!(camera.project(DVec3::new(9.0, 0.0, -1.0)).is_none());
@@ -618,7 +697,13 @@ mod tests {
 
     #[test]
     fn wide_fisheyes_look_behind_themselves() {
-        let camera = Camera::new(CameraModel::RadialFisheye, 640, 640, vec![150.0, 320.0, 320.0, 0.0, 0.0]).unwrap();
+        let camera = Camera::new(
+            CameraModel::RadialFisheye,
+            640,
+            640,
+            vec![150.0, 320.0, 320.0, 0.0, 0.0],
+        )
+        .unwrap();
         let direction = camera.direction(DVec2::new(320.0 + 150.0 * 2.0, 320.0));
         assert!(direction.z > 0.0);
         assert!((camera.project(direction).unwrap().x - 620.0).abs() < 1e-9);
@@ -627,10 +712,25 @@ mod tests {
     #[test]
     fn senseless_cameras_are_refused() {
         for (model, width, params, what) in [
-            (CameraModel::Pinhole, 640, vec![1.0; 3], "takes 4 parameters, not 3"),
-            (CameraModel::Pinhole, 640, vec![-1.0, 1.0, 1.0, 1.0], "focal length -1"),
+            (
+                CameraModel::Pinhole,
+                640,
+                vec![1.0; 3],
+                "takes 4 parameters, not 3",
+            ),
+            (
+                CameraModel::Pinhole,
+                640,
+                vec![-1.0, 1.0, 1.0, 1.0],
+                "focal length -1",
+            ),
             (CameraModel::Pinhole, 0, vec![1.0; 4], "0x480"),
-            (CameraModel::SimplePinhole, 640, vec![f64::NAN, 1.0, 1.0], "not finite"),
+            (
+                CameraModel::SimplePinhole,
+                640,
+                vec![f64::NAN, 1.0, 1.0],
+                "not finite",
+            ),
         ] {
             let error = Camera::new(model, width, 480, params).unwrap_err();
             assert!(error.contains(what), "{error}");

@@ -14,7 +14,15 @@ use super::{Camera, CameraModel, Format, Frame, FrameLens, Point, Reading, Skipp
 use crate::{Error, Result};
 
 /// Where a model may lie below a dataset's directory.
-const PLACES: [&str; 7] = ["sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "colmap/0", "colmap", ""];
+const PLACES: [&str; 7] = [
+    "sparse/0",
+    "sparse",
+    "colmap/sparse/0",
+    "colmap/sparse",
+    "colmap/0",
+    "colmap",
+    "",
+];
 
 /// Where pictures may lie below a dataset's directory.
 const IMAGE_FOLDERS: [&str; 6] = ["images", "image", "rgb", "input", "imgs", ""];
@@ -23,7 +31,13 @@ const IMAGE_FOLDERS: [&str; 6] = ["images", "image", "rgb", "input", "imgs", ""]
 pub(super) fn find_model(path: &Path) -> Option<PathBuf> {
     PLACES
         .into_iter()
-        .map(|place| if place.is_empty() { path.to_path_buf() } else { path.join(place) })
+        .map(|place| {
+            if place.is_empty() {
+                path.to_path_buf()
+            } else {
+                path.join(place)
+            }
+        })
         .find(|folder| part(folder, "cameras").is_some() || part(folder, "images").is_some())
 }
 
@@ -70,13 +84,22 @@ pub(super) fn read(path: &Path, model: &Path) -> Result<Reading> {
         let camera = cameras.get(&image.camera_id).ok_or_else(|| {
             Error::input(
                 &images_file,
-                format!("image {} refers to camera {}, which {} does not hold", image.name, image.camera_id, cameras_file.display()),
+                format!(
+                    "image {} refers to camera {}, which {} does not hold",
+                    image.name,
+                    image.camera_id,
+                    cameras_file.display()
+                ),
                 "export cameras and images together",
             )
         })?;
         let file = folder.join(&image.name);
         frames.push(Frame {
-            image: if file.is_file() { Ok(file) } else { Err(format!("no such file: {}", file.display())) },
+            image: if file.is_file() {
+                Ok(file)
+            } else {
+                Err(format!("no such file: {}", file.display()))
+            },
             mask: None,
             lens: FrameLens::Stated(camera.clone()),
             world_from_camera: image.world_from_camera,
@@ -109,12 +132,19 @@ fn folder_root(path: &Path, images: &Path) -> PathBuf {
 /// The folder that holds most of the pictures: below the dataset, or below one of the directories around the model.
 fn image_folder(path: &Path, model: &Path, images: &[ImageRecord]) -> PathBuf {
     let roots = std::iter::once(path).chain(model.ancestors().skip(1).take(3));
-    let candidates = roots.flat_map(|root| IMAGE_FOLDERS.into_iter().map(move |folder| root.join(folder)));
+    let candidates = roots.flat_map(|root| {
+        IMAGE_FOLDERS
+            .into_iter()
+            .map(move |folder| root.join(folder))
+    });
     // A sample is enough to tell the folders apart.
     let sample: Vec<_> = images.iter().step_by((images.len() / 32).max(1)).collect();
     let mut best = (0, path.join("images"));
     for folder in candidates.filter(|folder| folder.is_dir()) {
-        let there = sample.iter().filter(|image| folder.join(&image.name).is_file()).count();
+        let there = sample
+            .iter()
+            .filter(|image| folder.join(&image.name).is_file())
+            .count();
         if there > best.0 {
             best = (there, folder);
         }
@@ -149,11 +179,18 @@ pub(super) fn adopt_points(reading: &mut Reading, model: &Path) {
     };
     let other = match part(model, "images").map(|file| read_images(&file)) {
         Some(Ok(images)) => images,
-        Some(Err(error)) => return skip(format!("transforms.json is used, and this COLMAP model is not readable: {error}")),
+        Some(Err(error)) => {
+            return skip(format!(
+                "transforms.json is used, and this COLMAP model is not readable: {error}"
+            ));
+        }
         None => return skip("transforms.json is used; this COLMAP model has no images".into()),
     };
     if !reading.points.is_empty() {
-        return skip("transforms.json is used, with its own points; give this path to use the COLMAP model".into());
+        return skip(
+            "transforms.json is used, with its own points; give this path to use the COLMAP model"
+                .into(),
+        );
     }
     let world = reading.world_from_colmap;
     let base = |name: &str| name.rsplit('/').next().unwrap_or(name).to_owned();
@@ -167,11 +204,23 @@ pub(super) fn adopt_points(reading: &mut Reading, model: &Path) {
     let pairs: Vec<(DVec3, DVec3)> = reading
         .frames
         .iter()
-        .filter_map(|frame| Some((frame.world_from_camera.w_axis.truncate(), *positions.get(&base(&frame.name))?)))
+        .filter_map(|frame| {
+            Some((
+                frame.world_from_camera.w_axis.truncate(),
+                *positions.get(&base(&frame.name))?,
+            ))
+        })
         .collect();
     let mean = pairs.iter().map(|(here, _)| *here).sum::<DVec3>() / pairs.len().max(1) as f64;
-    let spread = pairs.iter().map(|(here, _)| (*here - mean).length()).sum::<f64>() / pairs.len().max(1) as f64;
-    let agree = pairs.iter().filter(|(here, there)| (*here - *there).length() <= 1e-3 * spread).count();
+    let spread = pairs
+        .iter()
+        .map(|(here, _)| (*here - mean).length())
+        .sum::<f64>()
+        / pairs.len().max(1) as f64;
+    let agree = pairs
+        .iter()
+        .filter(|(here, there)| (*here - *there).length() <= 1e-3 * spread)
+        .count();
     if pairs.len() < 3 || agree * 10 < pairs.len() * 9 {
         return skip(format!(
             "transforms.json is used; this COLMAP model has {agree} of {} cameras in the same places, so its points are of another frame",
@@ -187,7 +236,11 @@ pub(super) fn adopt_points(reading: &mut Reading, model: &Path) {
                 point.position = world.transform_point3(point.position);
             }
             let agreeing = format!("{agree} of {} cameras agree", pairs.len());
-            reading.notes.push(format!("{} points are from {}: {agreeing}", points.len(), file.display()));
+            reading.notes.push(format!(
+                "{} points are from {}: {agreeing}",
+                points.len(),
+                file.display()
+            ));
             reading.points = points;
         }
         Err(error) => skip(format!("its points are not readable: {error}")),
@@ -208,7 +261,9 @@ impl ImageRecord {
             Error::input(
                 file,
                 format!("{name}: {what}"),
-                format!("take {name} out of the model (colmap image_deleter), or export the poses again"),
+                format!(
+                    "take {name} out of the model (colmap image_deleter), or export the poses again"
+                ),
             )
         };
         if let Some(bad) = q.iter().chain(&t).find(|value| !value.is_finite()) {
@@ -216,9 +271,12 @@ impl ImageRecord {
         }
         let quaternion = DQuat::from_xyzw(q[1], q[2], q[3], q[0]);
         if !(quaternion.length() > 1e-6) {
-            return Err(bad_pose(format!("its rotation {q:?} is a quaternion of length 0")));
+            return Err(bad_pose(format!(
+                "its rotation {q:?} is a quaternion of length 0"
+            )));
         }
-        let camera_from_world = DMat4::from_rotation_translation(quaternion.normalize(), DVec3::from(t));
+        let camera_from_world =
+            DMat4::from_rotation_translation(quaternion.normalize(), DVec3::from(t));
         let world_from_camera = super::rigid(camera_from_world.inverse()).map_err(bad_pose)?;
         Ok(ImageRecord {
             world_from_camera: super::opengl_from_opencv(world_from_camera),
@@ -233,34 +291,63 @@ fn is_binary(file: &Path) -> bool {
 }
 
 fn read_cameras(file: &Path) -> Result<HashMap<u32, Camera>> {
-    if is_binary(file) { binary_cameras(file) } else { text_cameras(file) }
+    if is_binary(file) {
+        binary_cameras(file)
+    } else {
+        text_cameras(file)
+    }
 }
 
 fn read_images(file: &Path) -> Result<Vec<ImageRecord>> {
-    if is_binary(file) { binary_images(file) } else { text_images(file) }
+    if is_binary(file) {
+        binary_images(file)
+    } else {
+        text_images(file)
+    }
 }
 
 /// Points with finite positions; how many have not is noted.
 fn read_points(file: &Path, notes: &mut Vec<String>) -> Result<Vec<Point>> {
-    let mut points = if is_binary(file) { binary_points(file)? } else { text_points(file)? };
+    let mut points = if is_binary(file) {
+        binary_points(file)?
+    } else {
+        text_points(file)?
+    };
     let all = points.len();
     points.retain(|point| point.position.is_finite());
     if points.len() < all {
-        notes.push(format!("{} of {all} points in {} are not finite and left out", all - points.len(), file.display()));
+        notes.push(format!(
+            "{} of {all} points in {} are not finite and left out",
+            all - points.len(),
+            file.display()
+        ));
     }
     Ok(points)
 }
 
-fn camera_from(file: &Path, id: u32, model: CameraModel, size: (u64, u64), params: Vec<f64>) -> Result<Camera> {
+fn camera_from(
+    file: &Path,
+    id: u32,
+    model: CameraModel,
+    size: (u64, u64),
+    params: Vec<f64>,
+) -> Result<Camera> {
     let side = |pixels: u64| u32::try_from(pixels).unwrap_or(u32::MAX);
-    Camera::new(model, side(size.0), side(size.1), params)
-        .map_err(|what| Error::input(file, format!("camera {id}: {what}"), "correct or recompute the camera"))
+    Camera::new(model, side(size.0), side(size.1), params).map_err(|what| {
+        Error::input(
+            file,
+            format!("camera {id}: {what}"),
+            "correct or recompute the camera",
+        )
+    })
 }
 
 fn unsupported(file: &Path, id: u32, name: &str) -> Error {
     Error::input(
         file,
-        format!("camera {id} has the model {name}, which is not supported; models 0 (SIMPLE_PINHOLE) to 10 (THIN_PRISM_FISHEYE) are"),
+        format!(
+            "camera {id} has the model {name}, which is not supported; models 0 (SIMPLE_PINHOLE) to 10 (THIN_PRISM_FISHEYE) are"
+        ),
         "undistort the pictures with `colmap image_undistorter`, or use one of those models",
     )
 }
@@ -301,7 +388,10 @@ impl<'a> Bytes<'a> {
     }
 
     fn array<const N: usize>(&mut self, what: &dyn Fn() -> String) -> Result<[u8; N]> {
-        Ok(self.take(N as u64, what)?.try_into().expect("N bytes were taken"))
+        Ok(self
+            .take(N as u64, what)?
+            .try_into()
+            .expect("N bytes were taken"))
     }
 
     fn u32(&mut self, what: &dyn Fn() -> String) -> Result<u32> {
@@ -348,7 +438,9 @@ fn binary_cameras(file: &Path) -> Result<HashMap<u32, Camera>> {
         let (id, model_id) = (bytes.u32(&what)?, bytes.u32(&what)?);
         let Some(model) = CameraModel::from_id(model_id) else {
             // The model says how many parameters follow: behind an unknown one nothing can be read.
-            let name = UNSUPPORTED_MODELS.into_iter().find(|(known, _)| *known == model_id);
+            let name = UNSUPPORTED_MODELS
+                .into_iter()
+                .find(|(known, _)| *known == model_id);
             return Err(match name {
                 Some((_, name)) => unsupported(file, id, &format!("{name} (number {model_id})")),
                 None => unsupported(file, id, &format!("number {model_id}, unknown to COLMAP 4")),
@@ -374,8 +466,13 @@ fn binary_images(file: &Path) -> Result<Vec<ImageRecord>> {
         let (q, t) = (bytes.f64s::<4>(&what)?, bytes.f64s::<3>(&what)?);
         let camera_id = bytes.u32(&what)?;
         let rest = &bytes.data[bytes.at..];
-        let length = rest.iter().position(|byte| *byte == 0).unwrap_or(rest.len());
-        let name = bytes.take(length as u64 + 1, &|| format!("the name of image {number} of {count}"))?;
+        let length = rest
+            .iter()
+            .position(|byte| *byte == 0)
+            .unwrap_or(rest.len());
+        let name = bytes.take(length as u64 + 1, &|| {
+            format!("the name of image {number} of {count}")
+        })?;
         let name = String::from_utf8_lossy(&name[..length]).into_owned();
         let observations = bytes.count(24, "observed points of an image")?;
         bytes.take(observations as u64 * 24, &what)?;
@@ -504,7 +601,13 @@ fn text_images(file: &Path) -> Result<Vec<ImageRecord>> {
         if words.rest.is_empty() {
             return Err(words.error("ends before the picture's name"));
         }
-        images.push(ImageRecord::new(file, words.rest.to_owned(), camera_id, q, t)?);
+        images.push(ImageRecord::new(
+            file,
+            words.rest.to_owned(),
+            camera_id,
+            q,
+            t,
+        )?);
         // The second line, which may be empty, holds (x, y, point) for every feature.
         if let Some(observed) = lines.next() {
             let count = observed.rest.split_whitespace().count();

@@ -37,14 +37,18 @@ impl Header {
             return Some(stored);
         }
         let turned = (self.height, self.width);
-        (turns_sideways(self.orientation) && proportional(turned, (camera.width, camera.height))).then_some(turned)
+        (turns_sideways(self.orientation) && proportional(turned, (camera.width, camera.height)))
+            .then_some(turned)
     }
 }
 
 fn turns_sideways(orientation: Orientation) -> bool {
     matches!(
         orientation,
-        Orientation::Rotate90 | Orientation::Rotate270 | Orientation::Rotate90FlipH | Orientation::Rotate270FlipH
+        Orientation::Rotate90
+            | Orientation::Rotate270
+            | Orientation::Rotate90FlipH
+            | Orientation::Rotate270FlipH
     )
 }
 
@@ -56,13 +60,15 @@ fn proportional(a: (u32, u32), b: (u32, u32)) -> bool {
 }
 
 fn is_exr(path: &Path) -> bool {
-    path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("exr"))
+    path.extension()
+        .is_some_and(|extension| extension.eq_ignore_ascii_case("exr"))
 }
 
 /// Reads the header of the picture at `path`.
 pub(super) fn header(path: &Path) -> Result<Header> {
     if is_exr(path) {
-        let meta = exr::meta::MetaData::read_from_file(path, false).map_err(|error| undecodable(path, &error))?;
+        let meta = exr::meta::MetaData::read_from_file(path, false)
+            .map_err(|error| undecodable(path, &error))?;
         let size = meta.headers.first().map(|header| header.layer_size);
         let size = size.ok_or_else(|| undecodable(path, &"it holds no layer"))?;
         return Ok(Header {
@@ -88,7 +94,9 @@ fn decoder(path: &Path) -> Result<impl ImageDecoder> {
     let mut limits = image::Limits::default();
     limits.max_alloc = Some(4 << 30);
     reader.limits(limits);
-    reader.into_decoder().map_err(|error| undecodable(path, &error))
+    reader
+        .into_decoder()
+        .map_err(|error| undecodable(path, &error))
 }
 
 fn undecodable(path: &Path, error: &dyn std::fmt::Display) -> Error {
@@ -133,7 +141,12 @@ pub(super) fn load(view: &View, masks: bool) -> Result<Picture> {
             mask = upright(mask);
         }
         if mask.dimensions() != (width, height) {
-            return Err(mask_size(mask_path, mask.dimensions(), path, (width, height)));
+            return Err(mask_size(
+                mask_path,
+                mask.dimensions(),
+                path,
+                (width, height),
+            ));
         }
         for (pixel, mask) in rgba.pixels_mut().zip(mask.pixels()) {
             pixel[3] = (u32::from(pixel[3]) * u32::from(mask[3]) / 255) as u8;
@@ -142,7 +155,11 @@ pub(super) fn load(view: &View, masks: bool) -> Result<Picture> {
     let rgba = if (width, height) == wanted {
         rgba.into_raw()
     } else {
-        reduce(rgba.as_raw(), (width as usize, height as usize), (wanted.0 as usize, wanted.1 as usize))
+        reduce(
+            rgba.as_raw(),
+            (width as usize, height as usize),
+            (wanted.0 as usize, wanted.1 as usize),
+        )
     };
     Ok(Picture {
         width: wanted.0,
@@ -163,15 +180,20 @@ fn decode(path: &Path) -> Result<(RgbaImage, Orientation)> {
 }
 
 fn decode_exr(path: &Path) -> Result<RgbaImage> {
-    use exr::prelude::{read_first_rgba_layer_from_file, Vec2};
+    use exr::prelude::{Vec2, read_first_rgba_layer_from_file};
     let image = read_first_rgba_layer_from_file(
         path,
         |size: Vec2<usize>, _| RgbaImage::new(size.width() as u32, size.height() as u32),
         |image: &mut RgbaImage, at: Vec2<usize>, (r, g, b, a): (f32, f32, f32, f32)| {
             // EXR's colours are premultiplied by its alpha.
-            let straight = |channel: f32| srgb_from_linear(if a > 0.0 { channel / a } else { channel });
+            let straight =
+                |channel: f32| srgb_from_linear(if a > 0.0 { channel / a } else { channel });
             let alpha = (a.clamp(0.0, 1.0) * 255.0).round() as u8;
-            image.put_pixel(at.x() as u32, at.y() as u32, image::Rgba([straight(r), straight(g), straight(b), alpha]));
+            image.put_pixel(
+                at.x() as u32,
+                at.y() as u32,
+                image::Rgba([straight(r), straight(g), straight(b), alpha]),
+            );
         },
     )
     .map_err(|error| undecodable(path, &error))?;
@@ -180,7 +202,11 @@ fn decode_exr(path: &Path) -> Result<RgbaImage> {
 
 /// IEC 61966-2-1, to 8 bits; what is not a number is black.
 fn srgb_from_linear(linear: f32) -> u8 {
-    let linear = if linear.is_nan() { 0.0 } else { linear.clamp(0.0, 1.0) };
+    let linear = if linear.is_nan() {
+        0.0
+    } else {
+        linear.clamp(0.0, 1.0)
+    };
     let encoded = if linear <= 0.003_130_8 {
         12.92 * linear
     } else {
@@ -204,7 +230,9 @@ fn composite_on_black(rgba: &mut RgbaImage) {
 fn decode_mask(path: &Path) -> Result<RgbaImage> {
     let mut mask = decode(path)?.0;
     // Label images hold 0 and 1 instead of 0 and 255.
-    let labels = mask.pixels().all(|pixel| pixel.0[..3].iter().all(|channel| *channel <= 1));
+    let labels = mask
+        .pixels()
+        .all(|pixel| pixel.0[..3].iter().all(|channel| *channel <= 1));
     let hides = hides(path);
     for pixel in mask.pixels_mut() {
         let [r, g, b, _] = pixel.0.map(u32::from);
@@ -217,7 +245,8 @@ fn decode_mask(path: &Path) -> Result<RgbaImage> {
 
 /// instant-ngp's masks are white where something moved, that is where the picture does not count.
 fn hides(mask: &Path) -> bool {
-    mask.file_name().is_some_and(|name| name.to_string_lossy().starts_with("dynamic_mask_"))
+    mask.file_name()
+        .is_some_and(|name| name.to_string_lossy().starts_with("dynamic_mask_"))
 }
 
 /// Looks for the mask of a picture below `root` where the dataset names none: `masks/` beside `images/` (`masks_x` beside `images_x`),
@@ -243,12 +272,20 @@ pub(super) fn find_mask(root: &Path, image: &Path) -> Option<PathBuf> {
     }
     folders
         .into_iter()
-        .flat_map(|folder| [folder.join(format!("{stem}.png")), folder.join(format!("{file_name}.png"))])
+        .flat_map(|folder| {
+            [
+                folder.join(format!("{stem}.png")),
+                folder.join(format!("{file_name}.png")),
+            ]
+        })
         .find(|path| path.is_file())
 }
 
 /// Checks that a view's mask, if it has one, is as large as its picture.
-pub(super) fn check_mask(view: &View, upright: impl Fn(&Header) -> Option<(u32, u32)>) -> Result<()> {
+pub(super) fn check_mask(
+    view: &View,
+    upright: impl Fn(&Header) -> Option<(u32, u32)>,
+) -> Result<()> {
     let Some(mask_path) = &view.mask_path else {
         return Ok(());
     };
@@ -257,7 +294,12 @@ pub(super) fn check_mask(view: &View, upright: impl Fn(&Header) -> Option<(u32, 
     if same || Some((mask.width, mask.height)) == upright(&image) {
         return Ok(());
     }
-    Err(mask_size(mask_path, (mask.width, mask.height), &view.image_path, (image.width, image.height)))
+    Err(mask_size(
+        mask_path,
+        (mask.width, mask.height),
+        &view.image_path,
+        (image.width, image.height),
+    ))
 }
 
 fn mask_size(mask: &Path, mask_size: (u32, u32), image: &Path, image_size: (u32, u32)) -> Error {
@@ -312,7 +354,13 @@ fn reduce(rgba: &[u8], from: (usize, usize), to: (usize, usize)) -> Vec<u8> {
             }
         }
         for [r, g, b, alpha] in sums {
-            let colour = |premultiplied: f32| if alpha > 0.0 { (premultiplied / alpha).round() as u8 } else { 0 };
+            let colour = |premultiplied: f32| {
+                if alpha > 0.0 {
+                    (premultiplied / alpha).round() as u8
+                } else {
+                    0
+                }
+            };
             reduced.extend([colour(r), colour(g), colour(b), alpha.round() as u8]);
         }
     }
@@ -355,14 +403,20 @@ mod tests {
             .flat_map(|pixel| [(pixel * 37 % 256) as u8, (pixel * 11 % 256) as u8, 200, 255])
             .collect();
         let mean = |rgba: &[u8], channel: usize| {
-            rgba.chunks(4).map(|pixel| f64::from(pixel[channel])).sum::<f64>() / (rgba.len() / 4) as f64
+            rgba.chunks(4)
+                .map(|pixel| f64::from(pixel[channel]))
+                .sum::<f64>()
+                / (rgba.len() / 4) as f64
         };
         for to in [(13, 7), (6, 3), (5, 7), (1, 1), (12, 2)] {
             let small = reduce(&rgba, (width, height), to);
             assert_eq!(small.len(), to.0 * to.1 * 4);
             for channel in 0..4 {
                 let difference = mean(&small, channel) - mean(&rgba, channel);
-                assert!(difference.abs() < 0.5, "{to:?} channel {channel}: off by {difference}");
+                assert!(
+                    difference.abs() < 0.5,
+                    "{to:?} channel {channel}: off by {difference}"
+                );
             }
         }
         assert_eq!(reduce(&rgba, (width, height), (width, height)), rgba);
@@ -385,7 +439,15 @@ mod tests {
 
     #[test]
     fn srgb_has_its_published_values() {
-        let table = [(0.0, 0), (0.0031308, 10), (0.2158605, 128), (0.5, 188), (1.0, 255), (7.0, 255), (f32::NAN, 0)];
+        let table = [
+            (0.0, 0),
+            (0.0031308, 10),
+            (0.2158605, 128),
+            (0.5, 188),
+            (1.0, 255),
+            (7.0, 255),
+            (f32::NAN, 0),
+        ];
         for (linear, encoded) in table {
             assert_eq!(srgb_from_linear(linear), encoded, "{linear}");
         }

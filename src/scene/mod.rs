@@ -28,7 +28,6 @@ pub use bounds::{Region, RegionOverrides, RegionShape};
 pub use camera::{Camera, CameraModel, UNSUPPORTED_MODELS};
 pub use images::Picture;
 
-
 /// A dataset: posed views, sparse points where it has any, and what its author said of the region.
 #[derive(Clone, Debug)]
 pub struct Scene {
@@ -103,14 +102,18 @@ impl View {
 
     /// Origin and unit direction of the ray through `pixel`, world frame.
     pub fn ray(&self, pixel: DVec2) -> (DVec3, DVec3) {
-        let direction = self.world_from_camera.transform_vector3(self.camera.direction(pixel));
+        let direction = self
+            .world_from_camera
+            .transform_vector3(self.camera.direction(pixel));
         (self.position(), direction.normalize())
     }
 
     /// The pixel that `point` (world frame) falls on, if it lies within the picture.
     pub fn sees(&self, point: DVec3) -> Option<DVec2> {
         let rotation = DMat3::from_mat4(self.world_from_camera);
-        let pixel = self.camera.project(rotation.transpose() * (point - self.position()))?;
+        let pixel = self
+            .camera
+            .project(rotation.transpose() * (point - self.position()))?;
         self.camera.contains(pixel).then_some(pixel)
     }
 }
@@ -211,12 +214,17 @@ impl Scene {
     pub fn open(path: &Path, options: &SceneOptions) -> Result<Scene> {
         if !(options.downscale >= 1.0 && options.downscale.is_finite()) {
             return Err(Error::Config {
-                what: format!("images can be reduced by a factor of 1 or more, not {}", options.downscale),
+                what: format!(
+                    "images can be reduced by a factor of 1 or more, not {}",
+                    options.downscale
+                ),
             });
         }
         if options.holdout == 1 {
             return Err(Error::Config {
-                what: "holding out every view leaves none to train on; 8 is usual, 0 holds out none".into(),
+                what:
+                    "holding out every view leaves none to train on; 8 is usual, 0 holds out none"
+                        .into(),
             });
         }
         let mut reading = read(path)?;
@@ -236,7 +244,9 @@ impl Scene {
             notes: std::mem::take(&mut reading.notes),
             masks: options.masks,
         };
-        let given_split = frames.iter().any(|(frame, _)| frame.split == Some(Split::Test));
+        let given_split = frames
+            .iter()
+            .any(|(frame, _)| frame.split == Some(Split::Test));
         let mut resized: Vec<String> = Vec::new();
         for ((frame, image_path), header) in frames.into_iter().zip(headers) {
             let camera = frame_camera(&reading.file, &frame, &image_path, &header, &mut resized)?;
@@ -247,7 +257,9 @@ impl Scene {
                 camera.scaled(reduced(camera.width), reduced(camera.height))
             };
             let mask_path = if options.masks {
-                frame.mask.or_else(|| images::find_mask(&scene.root, &image_path))
+                frame
+                    .mask
+                    .or_else(|| images::find_mask(&scene.root, &image_path))
             } else {
                 None
             };
@@ -266,12 +278,13 @@ impl Scene {
             } else {
                 String::new()
             };
-            scene.notes.push(format!("{first}: the intrinsics were scaled{more}"));
+            scene
+                .notes
+                .push(format!("{first}: the intrinsics were scaled{more}"));
         }
-        scene
-            .views
-            .par_iter()
-            .try_for_each(|view| images::check_mask(view, |header| header.stored_or_turned_for(&view.camera)))?;
+        scene.views.par_iter().try_for_each(|view| {
+            images::check_mask(view, |header| header.stored_or_turned_for(&view.camera))
+        })?;
         if !given_split {
             hold_out(&mut scene, options.holdout);
         }
@@ -303,7 +316,11 @@ fn read(path: &Path) -> Result<Reading> {
         };
     }
     if !path.is_dir() {
-        return Err(Error::input(path, "does not exist", "check the path of the dataset"));
+        return Err(Error::input(
+            path,
+            "does not exist",
+            "check the path of the dataset",
+        ));
     }
     let json = ["transforms.json", "transforms_train.json"]
         .into_iter()
@@ -325,7 +342,12 @@ fn read(path: &Path) -> Result<Reading> {
 /// The error for a directory that holds no dataset that can be read: names what is there.
 fn unrecognised(path: &Path) -> Error {
     let mut names: Vec<String> = std::fs::read_dir(path)
-        .map(|entries| entries.flatten().map(|entry| entry.file_name().to_string_lossy().into_owned()).collect())
+        .map(|entries| {
+            entries
+                .flatten()
+                .map(|entry| entry.file_name().to_string_lossy().into_owned())
+                .collect()
+        })
         .unwrap_or_default();
     names.sort();
     let known = [
@@ -334,7 +356,10 @@ fn unrecognised(path: &Path) -> Error {
         ("cameras.npz", "a NeuS/DTU"),
         ("cams", "a Vis-MVSNet"),
     ];
-    if let Some((name, layout)) = known.into_iter().find(|(name, _)| names.iter().any(|there| there == name)) {
+    if let Some((name, layout)) = known
+        .into_iter()
+        .find(|(name, _)| names.iter().any(|there| there == name))
+    {
         return Error::input(
             path,
             format!("{name} says that this is {layout} dataset, a layout that is not read"),
@@ -350,7 +375,11 @@ fn unrecognised(path: &Path) -> Error {
         format!(
             "no dataset here: neither transforms.json, transforms_train.json, nor a COLMAP model (cameras, images and points3D as .bin \
              or .txt) in sparse/0, sparse, colmap/sparse/0 or the directory itself; it holds {}",
-            if names.is_empty() { "nothing".into() } else { there }
+            if names.is_empty() {
+                "nothing".into()
+            } else {
+                there
+            }
         ),
         "give the directory that holds one of them",
     )
@@ -386,7 +415,10 @@ fn present(reading: &mut Reading) -> Result<Vec<(Frame, PathBuf)>> {
         let (name, why) = &missing[0];
         return Err(Error::input(
             &reading.file,
-            format!("{} of the {total} pictures it names are missing; the first is {name}: {why}", missing.len()),
+            format!(
+                "{} of the {total} pictures it names are missing; the first is {name}: {why}",
+                missing.len()
+            ),
             "put the pictures where the dataset says they are, or correct its paths",
         ));
     }
@@ -408,7 +440,11 @@ fn frame_camera(
     let camera = match &frame.lens {
         FrameLens::Stated(camera) => camera.clone(),
         FrameLens::Keys(keys) => keys.camera(stored).map_err(|what| {
-            Error::input(file, format!("{}: {what}", frame.name), "correct the intrinsics and try again")
+            Error::input(
+                file,
+                format!("{}: {what}", frame.name),
+                "correct the intrinsics and try again",
+            )
         })?,
     };
     let Some((width, height)) = header.stored_or_turned_for(&camera) else {
@@ -418,7 +454,10 @@ fn frame_camera(
                 "the picture has {}x{} pixels, but its camera says {}x{}, which is no scaled version of that",
                 stored.0, stored.1, camera.width, camera.height
             ),
-            format!("use the pictures that the poses in {} were computed from", file.display()),
+            format!(
+                "use the pictures that the poses in {} were computed from",
+                file.display()
+            ),
         ));
     };
     if (width, height) == (camera.width, camera.height) {
@@ -454,7 +493,10 @@ fn check_enough_views(scene: &Scene, file: &Path) -> Result<()> {
     if train >= 2 {
         return Ok(());
     }
-    let (what, skipped) = (format!("{train} training view(s) of {}", scene.views.len()), scene.skipped.len());
+    let (what, skipped) = (
+        format!("{train} training view(s) of {}", scene.views.len()),
+        scene.skipped.len(),
+    );
     Err(Error::input(
         file,
         format!("{what}, {skipped} skipped: a surface takes at least 2, and tens for a good one"),
@@ -466,8 +508,14 @@ fn check_enough_views(scene: &Scene, file: &Path) -> Result<()> {
 ///
 /// A uniform scale is taken out of the rotation; the position stays.
 fn rigid(matrix: DMat4) -> std::result::Result<DMat4, String> {
-    if let Some(bad) = matrix.to_cols_array().into_iter().find(|entry| !entry.is_finite()) {
-        return Err(format!("the pose holds {bad}, which is not a number that a pose can have"));
+    if let Some(bad) = matrix
+        .to_cols_array()
+        .into_iter()
+        .find(|entry| !entry.is_finite())
+    {
+        return Err(format!(
+            "the pose holds {bad}, which is not a number that a pose can have"
+        ));
     }
     let (axes, position) = (DMat3::from_mat4(matrix), matrix.w_axis.truncate());
     let scale = axes.determinant().abs().cbrt();
@@ -484,7 +532,9 @@ fn rigid(matrix: DMat4) -> std::result::Result<DMat4, String> {
         .into_iter()
         .fold(0.0, |largest: f64, entry| largest.max(entry.abs()));
     if skew > 0.05 {
-        return Err(format!("the pose is not rigid: its axes are off from orthonormal by {skew:.3}"));
+        return Err(format!(
+            "the pose is not rigid: its axes are off from orthonormal by {skew:.3}"
+        ));
     }
     for _ in 0..6 {
         rotation = (rotation + rotation.inverse().transpose()) * 0.5;

@@ -88,13 +88,25 @@ struct Header {
 /// Reads the points of the PLY file at `path`. Those that are not finite are left out.
 pub(super) fn read_ply(path: &Path) -> Result<Vec<Point>> {
     let data = std::fs::read(path).map_err(|source| Error::io(path, source))?;
-    parse(&data).map_err(|what| Error::input(path, what, "export the points again as a PLY file with x, y, z"))
+    parse(&data).map_err(|what| {
+        Error::input(
+            path,
+            what,
+            "export the points again as a PLY file with x, y, z",
+        )
+    })
 }
 
 fn parse(data: &[u8]) -> std::result::Result<Vec<Point>, String> {
     let header = parse_header(data)?;
-    let column = |name: &str| header.properties.iter().position(|(property, _)| property == name);
-    let axis = |name: &str| column(name).ok_or_else(|| format!("its vertices have no property {name}"));
+    let column = |name: &str| {
+        header
+            .properties
+            .iter()
+            .position(|(property, _)| property == name)
+    };
+    let axis =
+        |name: &str| column(name).ok_or_else(|| format!("its vertices have no property {name}"));
     let axes = [axis("x")?, axis("y")?, axis("z")?];
     let channels = [column("red"), column("green"), column("blue")];
     let point = |values: &[f64]| {
@@ -125,9 +137,9 @@ fn parse(data: &[u8]) -> std::result::Result<Vec<Point>, String> {
         let mut words = text.split_ascii_whitespace();
         for vertex in 0..header.vertices {
             for value in &mut values {
-                let word = words
-                    .next()
-                    .ok_or_else(|| format!("it ends within vertex {vertex} of {}", header.vertices))?;
+                let word = words.next().ok_or_else(|| {
+                    format!("it ends within vertex {vertex} of {}", header.vertices)
+                })?;
                 *value = word
                     .parse()
                     .map_err(|_| format!("{word:?} in vertex {vertex} is not a number"))?;
@@ -136,7 +148,11 @@ fn parse(data: &[u8]) -> std::result::Result<Vec<Point>, String> {
         }
         return Ok(points);
     }
-    let stride: usize = header.properties.iter().map(|(_, number)| number.bytes()).sum();
+    let stride: usize = header
+        .properties
+        .iter()
+        .map(|(_, number)| number.bytes())
+        .sum();
     if header.vertices > (body.len() / stride) as u64 {
         return Err(format!(
             "it says that it holds {} vertices of {stride} bytes, but only {} bytes follow its header",
@@ -172,24 +188,37 @@ fn parse_header(data: &[u8]) -> std::result::Result<Header, String> {
         }
         match words.as_slice() {
             ["format", "ascii", _] => known = true,
-            ["format", "binary_little_endian", _] => (header.encoding, known) = (Encoding::LittleEndian, true),
-            ["format", "binary_big_endian", _] => (header.encoding, known) = (Encoding::BigEndian, true),
+            ["format", "binary_little_endian", _] => {
+                (header.encoding, known) = (Encoding::LittleEndian, true)
+            }
+            ["format", "binary_big_endian", _] => {
+                (header.encoding, known) = (Encoding::BigEndian, true)
+            }
             ["element", name, count] => {
                 if *name != "vertex" && element.is_empty() {
-                    return Err(format!("its first element is {name}; vertex has to come first"));
+                    return Err(format!(
+                        "its first element is {name}; vertex has to come first"
+                    ));
                 }
                 element = (*name).to_owned();
                 if element == "vertex" {
-                    header.vertices = count.parse().map_err(|_| format!("{count:?} is no number of vertices"))?;
+                    header.vertices = count
+                        .parse()
+                        .map_err(|_| format!("{count:?} is no number of vertices"))?;
                 }
             }
-            ["property", "list", ..] if element == "vertex" => return Err("its vertices hold a list".into()),
+            ["property", "list", ..] if element == "vertex" => {
+                return Err("its vertices hold a list".into());
+            }
             ["property", kind, name] if element == "vertex" => {
-                let kind = Number::named(kind).ok_or_else(|| format!("{kind:?} is no property type"))?;
+                let kind =
+                    Number::named(kind).ok_or_else(|| format!("{kind:?} is no property type"))?;
                 header.properties.push(((*name).to_owned(), kind));
             }
             ["end_header"] if known && !header.properties.is_empty() => return Ok(header),
-            ["end_header"] => return Err("its header names no format or no vertex properties".into()),
+            ["end_header"] => {
+                return Err("its header names no format or no vertex properties".into());
+            }
             _ => {}
         }
     }
@@ -217,7 +246,11 @@ mod tests {
     }
 
     fn binary(big_endian: bool) -> Vec<u8> {
-        let name = if big_endian { "binary_big_endian" } else { "binary_little_endian" };
+        let name = if big_endian {
+            "binary_big_endian"
+        } else {
+            "binary_little_endian"
+        };
         let mut data = format!("ply\nformat {name} 1.0\n{HEADER}").into_bytes();
         for point in wanted() {
             let [x, y] = [point.position.x as f32, point.position.y as f32];
@@ -246,9 +279,18 @@ mod tests {
     fn what_is_cut_short_is_refused() {
         let whole = binary(false);
         for length in 0..whole.len() {
-            assert!(parse(&whole[..length]).is_err(), "{length} of {} bytes", whole.len());
+            assert!(
+                parse(&whole[..length]).is_err(),
+                "{length} of {} bytes",
+                whole.len()
+            );
         }
-        let hostile = format!("ply\nformat binary_little_endian 1.0\n{HEADER}").replace("vertex 2", "vertex 99999999999999");
-        assert!(parse(hostile.as_bytes()).unwrap_err().contains("99999999999999"));
+        let hostile = format!("ply\nformat binary_little_endian 1.0\n{HEADER}")
+            .replace("vertex 2", "vertex 99999999999999");
+        assert!(
+            parse(hostile.as_bytes())
+                .unwrap_err()
+                .contains("99999999999999")
+        );
     }
 }

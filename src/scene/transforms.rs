@@ -10,13 +10,17 @@ use std::path::{Path, PathBuf};
 use glam::{DMat4, DVec3};
 use serde_json::{Map, Value};
 
-use super::{Camera, CameraModel, Format, Frame, FrameLens, Reading, RegionHint, Skipped, Split, points};
+use super::{
+    Camera, CameraModel, Format, Frame, FrameLens, Reading, RegionHint, Skipped, Split, points,
+};
 use crate::{Error, Result};
 
 type Object = Map<String, Value>;
 
 /// Endings tried where a path has none, or another one.
-const ENDINGS: [&str; 10] = ["png", "jpg", "jpeg", "JPG", "JPEG", "PNG", "exr", "tif", "tiff", "TIF"];
+const ENDINGS: [&str; 10] = [
+    "png", "jpg", "jpeg", "JPG", "JPEG", "PNG", "exr", "tif", "tiff", "TIF",
+];
 
 /// instant-ngp's defaults for `scale` and `offset`.
 const NGP_SCALE: f64 = 0.33;
@@ -25,7 +29,9 @@ const NGP_OFFSET: f64 = 0.5;
 /// Reads `file` and, beside a transforms.json or transforms_train.json, the held-out views of transforms_test.json or _val.json.
 pub(super) fn read(file: &Path) -> Result<Reading> {
     let root = file.parent().unwrap_or(Path::new("")).to_path_buf();
-    let blender = file.file_name().is_some_and(|name| name == "transforms_train.json");
+    let blender = file
+        .file_name()
+        .is_some_and(|name| name == "transforms_train.json");
     let document = Document::open(file)?;
     let mut reading = Reading {
         format: document.format(blender),
@@ -38,7 +44,11 @@ pub(super) fn read(file: &Path) -> Result<Reading> {
         file: file.to_path_buf(),
         root,
     };
-    if blender || file.file_name().is_some_and(|name| name == "transforms.json") {
+    if blender
+        || file
+            .file_name()
+            .is_some_and(|name| name == "transforms.json")
+    {
         read_held_out(&mut reading)?;
     }
     document.split_by_lists(&mut reading)?;
@@ -56,7 +66,9 @@ pub(super) fn read(file: &Path) -> Result<Reading> {
     reading.region_hint = document.region_hint(reading.points.is_empty())?;
     let skew = document.number(&document.top, "sk_x", "")?.unwrap_or(0.0);
     if skew.abs() > 1e-3 {
-        reading.notes.push(format!("sk_x = {skew} is not used: no camera model has skew"));
+        reading.notes.push(format!(
+            "sk_x = {skew} is not used: no camera model has skew"
+        ));
     }
     Ok(reading)
 }
@@ -67,7 +79,9 @@ fn read_held_out(reading: &mut Reading) -> Result<()> {
         .into_iter()
         .map(|name| reading.root.join(name))
         .filter(|file| file.is_file());
-    let Some(file) = files.next() else { return Ok(()) };
+    let Some(file) = files.next() else {
+        return Ok(());
+    };
     if let Some(other) = files.next() {
         reading.skipped.push(Skipped {
             what: other.display().to_string(),
@@ -78,12 +92,23 @@ fn read_held_out(reading: &mut Reading) -> Result<()> {
     for frame in &mut test {
         frame.split = Some(Split::Test);
     }
-    let images: HashSet<&PathBuf> = test.iter().filter_map(|frame| frame.image.as_ref().ok()).collect();
+    let images: HashSet<&PathBuf> = test
+        .iter()
+        .filter_map(|frame| frame.image.as_ref().ok())
+        .collect();
     let before = reading.frames.len();
-    reading.frames.retain(|frame| !frame.image.as_ref().is_ok_and(|image| images.contains(image)));
+    reading.frames.retain(|frame| {
+        !frame
+            .image
+            .as_ref()
+            .is_ok_and(|image| images.contains(image))
+    });
     if reading.frames.len() < before {
         let shared = before - reading.frames.len();
-        reading.notes.push(format!("{shared} views are in {} too, and so not trained on", file.display()));
+        reading.notes.push(format!(
+            "{shared} views are in {} too, and so not trained on",
+            file.display()
+        ));
     }
     reading.frames.extend(test);
     Ok(())
@@ -105,7 +130,11 @@ impl<'a> Document<'a> {
             .or_else(|error| serde_json::from_str(&without_bare_words(text)).map_err(|_| error));
         match parsed {
             Ok(Value::Object(top)) => Ok(Document { file, top }),
-            Ok(_) => Err(Error::input(file, "holds no object at its top", "export the poses again")),
+            Ok(_) => Err(Error::input(
+                file,
+                "holds no object at its top",
+                "export the poses again",
+            )),
             Err(error) => Err(Error::input(
                 file,
                 format!("is no JSON: {error} ({} bytes)", data.len()),
@@ -115,7 +144,11 @@ impl<'a> Document<'a> {
     }
 
     fn error(&self, what: impl Into<String>) -> Error {
-        Error::input(self.file, what, "correct the file, or export the poses again")
+        Error::input(
+            self.file,
+            what,
+            "correct the file, or export the poses again",
+        )
     }
 
     fn format(&self, blender: bool) -> Format {
@@ -124,7 +157,10 @@ impl<'a> Document<'a> {
             Format::Neuralangelo
         } else if blender {
             Format::Blender
-        } else if ["aabb_scale", "scale", "offset", "from_na"].into_iter().any(has) {
+        } else if ["aabb_scale", "scale", "offset", "from_na"]
+            .into_iter()
+            .any(has)
+        {
             Format::InstantNgp
         } else {
             Format::Nerfstudio
@@ -190,7 +226,11 @@ impl<'a> Document<'a> {
                 .ok_or_else(|| self.error(format!("{place}has no transform_matrix")))?;
             let mask = match entry.get("mask_path").and_then(Value::as_str) {
                 Some(mask) => Some(find(root, mask, &[]).map_err(|why| {
-                    Error::input(self.file, format!("{place}its mask: {why}"), "put the mask there, or take mask_path out of the frame")
+                    Error::input(
+                        self.file,
+                        format!("{place}its mask: {why}"),
+                        "put the mask there, or take mask_path out of the frame",
+                    )
                 })?),
                 None => None,
             };
@@ -207,7 +247,9 @@ impl<'a> Document<'a> {
     }
 
     fn pose(&self, value: &Value, place: &str) -> Result<DMat4> {
-        let matrix = self.matrix(value).map_err(|what| self.error(format!("{place}transform_matrix {what}")))?;
+        let matrix = self
+            .matrix(value)
+            .map_err(|what| self.error(format!("{place}transform_matrix {what}")))?;
         super::rigid(matrix).map_err(|what| {
             let next = "take this frame out of the file, or export the poses again";
             Error::input(self.file, format!("{place}{what}"), next)
@@ -223,11 +265,17 @@ impl<'a> Document<'a> {
         let mut matrix = DMat4::IDENTITY;
         for (row, entries) in rows.iter().enumerate() {
             let entries = entries.as_array().filter(|entries| entries.len() == 4);
-            let entries = entries.ok_or_else(|| format!("has a row {row} that is not 4 numbers"))?;
+            let entries =
+                entries.ok_or_else(|| format!("has a row {row} that is not 4 numbers"))?;
             for (column, entry) in entries.iter().enumerate() {
                 // Null is what NaN and Infinity were read as.
-                let number = if entry.is_null() { Some(f64::NAN) } else { entry.as_f64() };
-                let number = number.ok_or_else(|| format!("has {} in row {row}, column {column}", brief(entry)))?;
+                let number = if entry.is_null() {
+                    Some(f64::NAN)
+                } else {
+                    entry.as_f64()
+                };
+                let number = number
+                    .ok_or_else(|| format!("has {} in row {row}, column {column}", brief(entry)))?;
                 if !number.is_finite() {
                     return Err(format!("has NaN or infinity in row {row}, column {column}"));
                 }
@@ -242,8 +290,14 @@ impl<'a> Document<'a> {
     /// nerfstudio: what was done to COLMAP's world on the way into this file.
     fn applied_transform(&self) -> Result<DMat4> {
         let scale = self.number(&self.top, "applied_scale", "")?.unwrap_or(1.0);
-        let transform = match self.top.get("applied_transform").filter(|value| !value.is_null()) {
-            Some(value) => self.matrix(value).map_err(|what| self.error(format!("applied_transform {what}")))?,
+        let transform = match self
+            .top
+            .get("applied_transform")
+            .filter(|value| !value.is_null())
+        {
+            Some(value) => self
+                .matrix(value)
+                .map_err(|what| self.error(format!("applied_transform {what}")))?,
             None => DMat4::IDENTITY,
         };
         Ok(DMat4::from_scale(DVec3::splat(scale)) * transform)
@@ -252,17 +306,35 @@ impl<'a> Document<'a> {
     /// nerfstudio: lists of the frames that belong to each split.
     fn split_by_lists(&self, reading: &mut Reading) -> Result<()> {
         let list = |key: &str| -> Option<HashSet<String>> {
-            let names = self.top.get(key)?.as_array()?.iter().filter_map(Value::as_str);
-            Some(names.map(|name| name.replace('\\', "/").trim_start_matches("./").to_owned()).collect())
+            let names = self
+                .top
+                .get(key)?
+                .as_array()?
+                .iter()
+                .filter_map(Value::as_str);
+            Some(
+                names
+                    .map(|name| name.replace('\\', "/").trim_start_matches("./").to_owned())
+                    .collect(),
+            )
         };
-        let (train, val, test) = (list("train_filenames"), list("val_filenames"), list("test_filenames"));
-        let Some(held_out) = test.as_ref().or(val.as_ref()) else { return Ok(()) };
+        let (train, val, test) = (
+            list("train_filenames"),
+            list("val_filenames"),
+            list("test_filenames"),
+        );
+        let Some(held_out) = test.as_ref().or(val.as_ref()) else {
+            return Ok(());
+        };
         let mut unlisted = 0;
         reading.frames.retain_mut(|frame| {
             if frame.split.is_none() && held_out.contains(&frame.name) {
                 frame.split = Some(Split::Test);
             }
-            let keep = frame.split.is_some() || train.as_ref().is_none_or(|train| train.contains(&frame.name));
+            let keep = frame.split.is_some()
+                || train
+                    .as_ref()
+                    .is_none_or(|train| train.contains(&frame.name));
             unlisted += usize::from(!keep);
             keep
         });
@@ -283,12 +355,18 @@ impl<'a> Document<'a> {
                 Err(self.error(format!("{key} is {radius}, not a positive length")))
             }
         };
-        if let (Some(center), Some(radius)) = (self.vector("sphere_center")?, self.number(&self.top, "sphere_radius", "")?) {
+        if let (Some(center), Some(radius)) = (
+            self.vector("sphere_center")?,
+            self.number(&self.top, "sphere_radius", "")?,
+        ) {
             return Ok(Some(RegionHint {
                 center: DVec3::from(center),
                 radius: positive(radius, "sphere_radius")?,
                 half: None,
-                how: format!("sphere_center and sphere_radius of {}", file_name(self.file)),
+                how: format!(
+                    "sphere_center and sphere_radius of {}",
+                    file_name(self.file)
+                ),
             }));
         }
         if let Some(rows) = self.top.get("aabb_range").and_then(Value::as_array) {
@@ -312,14 +390,20 @@ impl<'a> Document<'a> {
         // A larger aabb_scale takes in the background; a scale of 1 is the author's word for where the object is.
         let aabb_scale = self.number(&self.top, "aabb_scale", "")?;
         if let Some(aabb_scale) = aabb_scale.filter(|scale| no_points && *scale <= 1.0) {
-            let scale = positive(self.number(&self.top, "scale", "")?.unwrap_or(NGP_SCALE), "scale")?;
+            let scale = positive(
+                self.number(&self.top, "scale", "")?.unwrap_or(NGP_SCALE),
+                "scale",
+            )?;
             let offset = self.vector("offset")?.unwrap_or([NGP_OFFSET; 3]);
             let radius = positive(0.5 * aabb_scale / scale, "aabb_scale / scale / 2")?;
             return Ok(Some(RegionHint {
                 center: (DVec3::splat(0.5) - DVec3::from(offset)) / scale,
                 radius,
                 half: Some(DVec3::splat(radius)),
-                how: format!("instant-ngp's unit cube (aabb_scale {aabb_scale}, scale {scale}) of {}", file_name(self.file)),
+                how: format!(
+                    "instant-ngp's unit cube (aabb_scale {aabb_scale}, scale {scale}) of {}",
+                    file_name(self.file)
+                ),
             }));
         }
         Ok(None)
@@ -329,9 +413,13 @@ impl<'a> Document<'a> {
     fn intrinsics(&self, frame: &Object, place: &str) -> Result<Intrinsics> {
         // Keys that belong together come from the same level.
         let group = |keys: &[&str]| -> Result<Vec<Option<f64>>> {
-            let own = keys.iter().any(|key| frame.get(*key).is_some_and(|value| !value.is_null()));
+            let own = keys
+                .iter()
+                .any(|key| frame.get(*key).is_some_and(|value| !value.is_null()));
             let object = if own { frame } else { &self.top };
-            keys.iter().map(|key| self.number(object, key, place)).collect()
+            keys.iter()
+                .map(|key| self.number(object, key, place))
+                .collect()
         };
         let either = |key: &str| frame.get(key).or_else(|| self.top.get(key));
         let is_true = |key: &str| either(key).is_some_and(|value| value.as_bool() == Some(true));
@@ -344,26 +432,41 @@ impl<'a> Document<'a> {
                 return Err(self.unsupported_lens(place, lens));
             }
         }
-        if self.number(frame, "ftheta_p0", place)?.or(self.number(&self.top, "ftheta_p0", place)?).is_some() {
+        if self
+            .number(frame, "ftheta_p0", place)?
+            .or(self.number(&self.top, "ftheta_p0", place)?)
+            .is_some()
+        {
             return Err(self.unsupported_lens(place, "F-theta"));
         }
-        let model = either("camera_model").and_then(Value::as_str).unwrap_or("OPENCV");
+        let model = either("camera_model")
+            .and_then(Value::as_str)
+            .unwrap_or("OPENCV");
         let fisheye = match model.to_ascii_uppercase().as_str() {
-            "OPENCV" | "PINHOLE" | "SIMPLE_PINHOLE" | "SIMPLE_RADIAL" | "RADIAL" | "FULL_OPENCV" | "PERSPECTIVE" => is_true("is_fisheye"),
+            "OPENCV" | "PINHOLE" | "SIMPLE_PINHOLE" | "SIMPLE_RADIAL" | "RADIAL"
+            | "FULL_OPENCV" | "PERSPECTIVE" => is_true("is_fisheye"),
             "OPENCV_FISHEYE" | "FISHEYE" | "SIMPLE_RADIAL_FISHEYE" | "RADIAL_FISHEYE" => true,
             _ => return Err(self.unsupported_lens(place, model)),
         };
         let mut focal = group(&["fl_x", "fl_y"])?;
         let mut center = group(&["cx", "cy"])?;
         if let Some(matrix) = either("intrinsic_matrix").filter(|_| focal == [None, None]) {
-            let entry = |row: usize, column: usize| matrix.get(row).and_then(|row| row.get(column)).and_then(Value::as_f64);
+            let entry = |row: usize, column: usize| {
+                matrix
+                    .get(row)
+                    .and_then(|row| row.get(column))
+                    .and_then(Value::as_f64)
+            };
             focal = vec![entry(0, 0), entry(1, 1)];
             center = vec![entry(0, 2), entry(1, 2)];
         }
         let mut angle = group(&["camera_angle_x", "camera_angle_y"])?;
         if angle == [None, None] {
             let degrees = group(&["x_fov", "y_fov"])?;
-            angle = degrees.into_iter().map(|angle| angle.map(f64::to_radians)).collect();
+            angle = degrees
+                .into_iter()
+                .map(|angle| angle.map(f64::to_radians))
+                .collect();
         }
         let size = match group(&["w", "h"])?[..] {
             [Some(w), Some(h)] if w >= 1.0 && h >= 1.0 => Some((w as u32, h as u32)),
@@ -388,7 +491,9 @@ impl<'a> Document<'a> {
     fn unsupported_lens(&self, place: &str, lens: &str) -> Error {
         Error::input(
             self.file,
-            format!("{place}the camera model {lens} is not supported; OPENCV, OPENCV_FISHEYE and simpler ones are"),
+            format!(
+                "{place}the camera model {lens} is not supported; OPENCV, OPENCV_FISHEYE and simpler ones are"
+            ),
             "undistort the pictures to a pinhole camera first",
         )
     }
@@ -417,15 +522,26 @@ impl Intrinsics {
         let from_angle = |axis: usize| {
             let angle = self.angle[axis]?;
             let half = 0.5 * sides[axis];
-            Some(if self.fisheye { 2.0 * half / angle } else { half / (0.5 * angle).tan() })
+            Some(if self.fisheye {
+                2.0 * half / angle
+            } else {
+                half / (0.5 * angle).tan()
+            })
         };
-        let given = if self.focal != [None, None] { self.focal } else { [from_angle(0), from_angle(1)] };
+        let given = if self.focal != [None, None] {
+            self.focal
+        } else {
+            [from_angle(0), from_angle(1)]
+        };
         let (fx, fy) = match given {
             [Some(fx), Some(fy)] => (fx, fy),
             [Some(f), None] | [None, Some(f)] => (f, f),
             [None, None] => return Err("no focal length: neither fl_x, camera_angle_x, x_fov nor intrinsic_matrix is there".into()),
         };
-        let (cx, cy) = (self.center[0].unwrap_or(0.5 * sides[0]), self.center[1].unwrap_or(0.5 * sides[1]));
+        let (cx, cy) = (
+            self.center[0].unwrap_or(0.5 * sides[0]),
+            self.center[1].unwrap_or(0.5 * sides[1]),
+        );
         let [k1, k2, k3, k4, k5, k6, p1, p2] = self.distortion;
         let mut params = vec![fx, fy, cx, cy];
         let model = if self.fisheye {
@@ -436,7 +552,9 @@ impl Intrinsics {
             params.extend([k1, k2, p1, p2, k3, k4, k5, k6]);
             CameraModel::FullOpencv
         } else if k4 != 0.0 {
-            return Err(format!("k4 = {k4} of a perspective lens: a radial polynomial of the 8th degree is not supported"));
+            return Err(format!(
+                "k4 = {k4} of a perspective lens: a radial polynomial of the 8th degree is not supported"
+            ));
         } else if k3 != 0.0 {
             params.extend([k1, k2, p1, p2, k3, 0.0, 0.0, 0.0]);
             CameraModel::FullOpencv
@@ -453,11 +571,17 @@ impl Intrinsics {
 /// The file that `path` means: as it is (with either slash), with another ending, or by its last parts below `root`.
 fn find(root: &Path, path: &str, endings: &[&str]) -> std::result::Result<PathBuf, String> {
     let path = path.replace('\\', "/");
-    let parts: Vec<&str> = path.split('/').filter(|part| !part.is_empty() && *part != ".").collect();
+    let parts: Vec<&str> = path
+        .split('/')
+        .filter(|part| !part.is_empty() && *part != ".")
+        .collect();
     let stated = root.join(&path);
     let shorter = (1..parts.len()).map(|from| root.join(parts[from..].join("/")));
     let in_images = parts.last().map(|name| root.join("images").join(name));
-    for candidate in std::iter::once(stated.clone()).chain(shorter).chain(in_images) {
+    for candidate in std::iter::once(stated.clone())
+        .chain(shorter)
+        .chain(in_images)
+    {
         if candidate.is_file() {
             return Ok(candidate);
         }
@@ -512,5 +636,8 @@ fn brief(value: &Value) -> String {
 }
 
 fn file_name(path: &Path) -> String {
-    path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned()
+    path.file_name()
+        .unwrap_or(path.as_os_str())
+        .to_string_lossy()
+        .into_owned()
 }

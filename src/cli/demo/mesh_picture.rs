@@ -464,28 +464,35 @@ fn decode_srgb(byte: u8) -> f32 {
 mod tests {
     use super::*;
 
-    /// A cube of half edge `half`, wound outwards, each corner in its own colour.
-    fn cube(half: f32) -> (Vec<[f32; 3]>, Vec<[u32; 3]>, Vec<[u8; 3]>) {
-        let corners: Vec<[f32; 3]> = (0..8)
-            .map(|k| [0, 1, 2].map(|axis| if k >> axis & 1 == 1 { half } else { -half }))
-            .collect();
-        let quads = [
-            [0, 2, 3, 1],
-            [4, 5, 7, 6],
-            [0, 1, 5, 4],
-            [2, 6, 7, 3],
-            [0, 4, 6, 2],
-            [1, 3, 7, 5],
-        ];
-        let faces = quads
-            .iter()
-            .flat_map(|q| [[q[0], q[1], q[2]], [q[0], q[2], q[3]]])
-            .collect();
-        let colors = corners
-            .iter()
-            .map(|p| p.map(|x| if x > 0.0 { 255 } else { 0 }))
-            .collect();
-        (corners, faces, colors)
+    /// A cube of edge 1, wound outwards, each corner in its own colour.
+    struct Cube {
+        positions: Vec<[f32; 3]>,
+        faces: Vec<[u32; 3]>,
+        colors: Vec<[u8; 3]>,
+    }
+
+    impl Cube {
+        fn new() -> Cube {
+            let upper = |k: u32, axis: u32| k >> axis & 1 == 1;
+            let quads = [
+                [0, 2, 3, 1],
+                [4, 5, 7, 6],
+                [0, 1, 5, 4],
+                [2, 6, 7, 3],
+                [0, 4, 6, 2],
+                [1, 3, 7, 5],
+            ];
+            let split = |q: &[u32; 4]| [[q[0], q[1], q[2]], [q[0], q[2], q[3]]];
+            Cube {
+                positions: (0..8)
+                    .map(|k| [0, 1, 2].map(|axis| if upper(k, axis) { 0.5 } else { -0.5 }))
+                    .collect(),
+                faces: quads.iter().flat_map(split).collect(),
+                colors: (0..8)
+                    .map(|k| [0, 1, 2].map(|axis| if upper(k, axis) { 255 } else { 0 }))
+                    .collect(),
+            }
+        }
     }
 
     /// Looks down at the origin from a height of 4.
@@ -508,12 +515,12 @@ mod tests {
 
     #[test]
     fn a_cube_is_seen_where_it_is() {
-        let (positions, faces, colors) = cube(0.5);
+        let cube = Cube::new();
         let mesh = Triangles {
-            positions: &positions,
-            faces: &faces,
+            positions: &cube.positions,
+            faces: &cube.faces,
             normals: None,
-            colors: Some(&colors),
+            colors: Some(&cube.colors),
         };
         for (lens, half) in [
             (Lens::Parallel(40.0), 20.0),
@@ -590,7 +597,11 @@ mod tests {
 
     #[test]
     fn an_open_surface_shows_its_inner_side() {
-        let (positions, mut faces, _) = cube(0.5);
+        let Cube {
+            positions,
+            mut faces,
+            ..
+        } = Cube::new();
         // Without the upper face one looks at the lower one from within.
         faces.drain(2..4);
         let mesh = Triangles {

@@ -348,15 +348,14 @@ mod tests {
     fn every_part_is_a_distance_bound() {
         // A function with slope at most 1 that is zero on the surface cannot exceed the distance to it.
         for (index, part) in PARTS.iter().enumerate() {
-            let mut near = 0;
-            for (p, towards) in points(200_000).zip(points(200_001).skip(1)) {
+            let pairs = points(200_000).zip(points(200_001).skip(1));
+            for (near, (p, towards)) in pairs.enumerate() {
                 // Half of the points are pulled close to the part, where its details decide.
                 let p = if near % 2 == 0 {
                     p
                 } else {
                     p.clamp(part.low, part.high)
                 };
-                near += 1;
                 let q = p + 1e-3 * (towards - p).normalize();
                 let (a, b) = (part.sdf(p), part.sdf(q));
                 assert!(
