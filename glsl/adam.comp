@@ -1,7 +1,6 @@
 #version 460
 // AdamW with decoupled decay, one parameter per invocation (Loshchilov & Hutter 2019, algorithm 2; Adam where weight_decay is 0).
 // Entries without gradient decay and move on by their momentum like all others. A step whose loss is not finite changes nothing.
-#extension GL_GOOGLE_include_directive : require
 #include "lib/prelude.glsl"
 
 layout(push_constant, scalar) uniform Args {

@@ -1,6 +1,5 @@
 #version 460
 // Gradient of a ray's appearance code: the sum over the ray's samples, one (ray, channel) per invocation.
-#extension GL_GOOGLE_include_directive : require
 #include "lib/prelude.glsl"
 
 layout(push_constant, scalar) uniform Args {

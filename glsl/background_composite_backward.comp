@@ -1,7 +1,6 @@
 #version 460
 // Adjoint of background_composite_forward, one ray per invocation. With C_after the colour behind sample i,
 //   ∂C/∂τ_i = T_{i+1} c_i − C_after,  ∂τ_i/∂out_i = τ_i.
-#extension GL_GOOGLE_include_directive : require
 #include "lib/prelude.glsl"
 
 layout(push_constant, scalar) uniform Args {

@@ -1,6 +1,5 @@
 #version 460
 // Background colour of a ray: C = Σ w c with σ = exp(out), w_i = (1 − e^{−σδ}) T_i on black (METHOD 2.6, 2.8). One ray per invocation.
-#extension GL_GOOGLE_include_directive : require
 #include "lib/prelude.glsl"
 
 layout(push_constant, scalar) uniform Args {

@@ -1,6 +1,5 @@
 #version 460
 // One learned colour behind everything: C = sigmoid(logits), one ray per invocation.
-#extension GL_GOOGLE_include_directive : require
 #include "lib/prelude.glsl"
 
 layout(push_constant, scalar) uniform Args {

@@ -1,6 +1,5 @@
 #version 460
 // Gradient of the learned background colour: the sum over all rays through the sigmoid, added up by one workgroup in a fixed order.
-#extension GL_GOOGLE_include_directive : require
 #include "lib/prelude.glsl"
 
 layout(push_constant, scalar) uniform Args {

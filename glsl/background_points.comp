@@ -3,7 +3,6 @@
 // disparity 1/t = s/far + (1 − s)/exit; positions at the midpoints. One ray per invocation.
 // With CONTRACTION, x ↦ (2 − 1/‖x‖) x/‖x‖ beyond the unit sphere and halved, so that all space falls into the hash grid's cube;
 // without, the published uncontracted positions, whose indices wrap.
-#extension GL_GOOGLE_include_directive : require
 #include "lib/prelude.glsl"
 
 layout(constant_id = 0) const uint CONTRACTION = 1;

@@ -2,7 +2,6 @@
 // Adjoint of field_forward up to the hash features, one point per invocation:
 //   d_h = w₂ d_out (+ what further heads send back),  d_u = d_h σ'(u),  d_e = W₁ᵀ d_u,  d_w₂ += h d_out,  d_b₂ += d_out.
 // u is computed again from z: reading it back would cost more than the sum. d_u goes to weight_gradient, d_e to hash_grid_backward.
-#extension GL_GOOGLE_include_directive : require
 #include "lib/prelude.glsl"
 #include "lib/field.glsl"
 

@@ -2,7 +2,6 @@
 // Hash grid, hidden layer and first output of a field in one pass, one point per invocation:
 //   z = [x, e(x)],  u = W₁z + b₁,  h = σ(u),  out = w₂·h + b₂.
 // The SDF and its taps, the proposal densities and the background density are all this kernel (METHOD 2.3, 2.4, 2.8).
-#extension GL_GOOGLE_include_directive : require
 #include "lib/prelude.glsl"
 #include "lib/hash_grid.glsl"
 #include "lib/field.glsl"

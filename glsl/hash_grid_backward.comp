@@ -2,7 +2,6 @@
 // Scatter of ∂loss/∂features into the hash table: d_table[corner] += weight · d_e, one (point, level) per invocation.
 // The level is the grid's slice: only one level's gradients need to fit the cache, and devices that split a grid into contiguous
 // parts never let two cores meet in one level. Slices take levels from both ends in turn, so that such parts cost the same.
-#extension GL_GOOGLE_include_directive : require
 #include "lib/prelude.glsl"
 #include "lib/hash_grid.glsl"
 

@@ -1,6 +1,5 @@
 #version 460
 // Points of a regular lattice, x fastest: origin + step·(i, j, k). One point per invocation.
-#extension GL_GOOGLE_include_directive : require
 #include "lib/prelude.glsl"
 
 layout(push_constant, scalar) uniform Args {

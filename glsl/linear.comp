@@ -1,7 +1,6 @@
 #version 460
 // One layer of a network on planar activations: Y = σ(WX + b), or with TRANSPOSED its adjoint d_X = Wᵀd_Y, gated by the derivative
 // of the ReLU that made X. One sample and TILE output channels per invocation; the slice picks the channels.
-#extension GL_GOOGLE_include_directive : require
 #include "lib/prelude.glsl"
 
 layout(constant_id = 0) const uint INPUTS = 64;

@@ -1,6 +1,5 @@
 #version 460
 // Rendered normals: Σ w n over a ray's samples with n = g/‖g‖ (METHOD 2.6; not normalised again), one ray per invocation.
-#extension GL_GOOGLE_include_directive : require
 #include "lib/prelude.glsl"
 #include "lib/shading.glsl"
 

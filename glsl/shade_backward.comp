@@ -1,7 +1,6 @@
 #version 460
 // Adjoint of shade_forward into the taps, one sample per invocation: the gradient g hears from the colour network and from the
 // eikonal loss λ/B Σ(‖g‖ − 1)², and passes ±d_g/2δ on to the six SDF values.
-#extension GL_GOOGLE_include_directive : require
 #include "lib/prelude.glsl"
 #include "lib/sampling.glsl"
 #include "lib/shading.glsl"

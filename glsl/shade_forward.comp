@@ -2,7 +2,6 @@
 // From SDF values at a sample and its six taps to the colour network's input, one sample per invocation:
 //   g_j = [f(x + δe_j) − f(x − δe_j)] / 2δ  (METHOD 3),  eikonal term (‖g‖ − 1)²  (METHOD 4.2),
 //   direction encoding sin(2ᵏd), sin(2ᵏd + π/2) for k = 0…3, then d (METHOD 2.7).
-#extension GL_GOOGLE_include_directive : require
 #include "lib/prelude.glsl"
 #include "lib/sampling.glsl"
 #include "lib/shading.glsl"

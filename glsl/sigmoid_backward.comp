@@ -1,6 +1,5 @@
 #version 460
 // Adjoint of y = sigmoid(u) in place: d_u = d_y · y(1 − y).
-#extension GL_GOOGLE_include_directive : require
 #include "lib/prelude.glsl"
 
 layout(push_constant, scalar) uniform Args {

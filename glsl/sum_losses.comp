@@ -1,12 +1,15 @@
 #version 460
 #define LOCAL_SIZE 256
 #include "lib/prelude.glsl"
-// Sums of loss arrays: losses[k] = scale_k * sum of term k's values, losses[n_terms] = their total. ONE workgroup, fixed order: the same
+// Sums of loss arrays: losses[k] = scale_k * sum of term k's values, losses[n_terms] = the total
+// of those that count. ONE workgroup, fixed order: the same
 // values give the same sums in every run. non_finite is set where a sum is not a number or infinite, and never cleared here.
 struct LossTerm {
     F32s values; // [count]
     uint count;
     float scale;
+    uint counts; // 1: a loss, 0: a figure for the log
+    uint padding;
 };
 layout(buffer_reference, scalar, buffer_reference_align = 8) readonly buffer LossTerms { LossTerm at[]; };
 
@@ -33,7 +36,7 @@ void main() {
             barrier();
         }
         float loss = term.scale * partial[0];
-        total += loss;
+        if (term.counts != 0u) total += loss;
         if (lane == 0u) losses.at[k] = loss;
         barrier(); // before the next term reuses partial
     }

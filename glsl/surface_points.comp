@@ -31,7 +31,7 @@ void main() {
         points.at[axis * total + index] = start[axis];
     }
     if (n_blocks == 1u) return;
-    float delta = max(tap_range * tap_draws.at[index], tap_floor);
+    float delta = tap_step(tap_draws.at[index], tap_range, tap_floor);
     [[unroll]] for (uint axis = 0u; axis < 3u; axis++) {
         [[unroll]] for (uint tap = 0u; tap < 3u; tap++) {
             uint plus = axis * total + (1u + 2u * tap) * count + index;

@@ -2,7 +2,6 @@
 // Weight and bias gradients of a layer: d_W[o, i] += Σ_n d_Y[o, n] X[i, n],  d_b[o] += Σ_n d_Y[o, n].
 // A workgroup sums one 8×8 tile of the matrix over `chunk` samples in registers, adds up its lanes and subgroups, and touches memory
 // once per entry. The bias is the column of an input that is always 1. The slice is the tile; workgroups along x are the chunks.
-#extension GL_GOOGLE_include_directive : require
 #include "lib/prelude.glsl"
 
 layout(constant_id = 0) const uint INPUTS = 64;
@@ -27,7 +26,7 @@ void main() {
     const uint COLUMN_TILES = (INPUTS + BIAS + TILE - 1u) / TILE;
     uint o0 = slice() / COLUMN_TILES * TILE;
     uint i0 = slice() % COLUMN_TILES * TILE;
-    uint first = item() / gl_WorkGroupSize.x * chunk;
+    uint first = group() * chunk;
     uint end = min(first + chunk, n);
 
     float sum[TILE * TILE];

@@ -1,7 +1,6 @@
 #version 460
 // Adjoint of weight_norm_forward, one row per invocation: with s = d_W·v/‖v‖,
 //   d_g += s,  d_v += g/‖v‖ (d_W − s v/‖v‖).  d_W is consumed: zeroed for the next step.
-#extension GL_GOOGLE_include_directive : require
 #include "lib/prelude.glsl"
 #include "lib/weight_rows.glsl"
 

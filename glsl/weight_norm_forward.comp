@@ -1,6 +1,5 @@
 #version 460
 // Effective weights of every weight-normalised row: W = g·v/‖v‖ (Salimans & Kingma 2016), one row per invocation.
-#extension GL_GOOGLE_include_directive : require
 #include "lib/prelude.glsl"
 #include "lib/weight_rows.glsl"
 

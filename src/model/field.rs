@@ -55,7 +55,10 @@ impl FieldBuffers {
         Ok(FieldBuffers {
             n,
             n_hidden,
-            inputs: gpu.scratch(&format!("{name} inputs"), u64::from(shape.inputs()) * u64::from(n))?,
+            inputs: gpu.scratch(
+                &format!("{name} inputs"),
+                u64::from(shape.inputs()) * u64::from(n),
+            )?,
             hidden: gpu.scratch(&format!("{name} hidden"), hidden_len)?,
             d_hidden: gpu.scratch(&format!("{name} d_hidden"), hidden_len)?,
         })
@@ -72,7 +75,11 @@ impl Scratch {
     /// Enough for each of the given (shape, points).
     pub fn new(gpu: &Gpu, users: &[(FieldShape, u32)]) -> Result<Self> {
         let most = |per_point: fn(&FieldShape) -> u32| {
-            users.iter().map(|(shape, n)| u64::from(per_point(shape)) * u64::from(*n)).max().unwrap_or(1)
+            users
+                .iter()
+                .map(|(shape, n)| u64::from(per_point(shape)) * u64::from(*n))
+                .max()
+                .unwrap_or(1)
         };
         Ok(Scratch {
             d_preactivation: gpu.scratch("d_preactivation", most(|s| s.hidden))?,
@@ -84,7 +91,12 @@ impl Scratch {
 impl Field {
     /// Builds a field over parameters that stand at `table`, `hidden` and row 0 of `heads`.
     pub fn new(
-        gpu: &Gpu, label: &str, shape: FieldShape, table: u64, hidden: WeightHandle, heads: WeightHandle,
+        gpu: &Gpu,
+        label: &str,
+        shape: FieldShape,
+        table: u64,
+        hidden: WeightHandle,
+        heads: WeightHandle,
     ) -> Result<Field> {
         let table_rows = shape.grid.level_table();
         let levels = gpu.buffer::<Level>(&format!("{label} levels"), table_rows.len() as u64)?;
@@ -127,7 +139,12 @@ impl Field {
             levels,
             forward: gpu.kernel(forward)?.labelled(label),
             backward: gpu.kernel(backward)?.labelled(label),
-            scatter: gpu.kernel(hash_grid_backward::Shape { levels: grid_levels, features })?.labelled(label),
+            scatter: gpu
+                .kernel(hash_grid_backward::Shape {
+                    levels: grid_levels,
+                    features,
+                })?
+                .labelled(label),
             hidden_gradient: Layer::new(gpu, &format!("{label} hidden"), gradient, hidden)?,
             shape,
         })
@@ -142,7 +159,14 @@ impl Field {
     }
 
     /// First output at `points [3, n]`, into `first [n]`.
-    pub fn forward(&self, rec: &mut Recorder, params: &Params, points: Ptr<f32>, buffers: &FieldBuffers, first: PtrMut<f32>) {
+    pub fn forward(
+        &self,
+        rec: &mut Recorder,
+        params: &Params,
+        points: Ptr<f32>,
+        buffers: &FieldBuffers,
+        first: PtrMut<f32>,
+    ) {
         let n = buffers.n;
         let args = field_forward::Args {
             levels: self.levels.ptr(),
@@ -160,12 +184,21 @@ impl Field {
         };
         let flops = self.hidden_flops() + 2.0 * 8.0 * f64::from(self.shape.grid.outputs());
         let bytes = self.gather_bytes() + 8.0 * f64::from(self.shape.inputs());
-        rec.run(&self.forward, Work::items(u64::from(n)).flops(flops).bytes(bytes), args);
+        rec.run(
+            &self.forward,
+            Work::items(u64::from(n)).flops(flops).bytes(bytes),
+            args,
+        );
     }
 
     /// Adds all parameter gradients, from `d_first [n]` and, for the leading points, the heads' `buffers.d_hidden`.
     pub fn backward(
-        &self, rec: &mut Recorder, params: &Params, points: Ptr<f32>, d_first: Ptr<f32>, buffers: &FieldBuffers,
+        &self,
+        rec: &mut Recorder,
+        params: &Params,
+        points: Ptr<f32>,
+        d_first: Ptr<f32>,
+        buffers: &FieldBuffers,
         scratch: &Scratch,
     ) {
         let n = buffers.n;
@@ -183,9 +216,23 @@ impl Field {
             n,
             n_hidden: buffers.n_hidden,
         };
-        let bytes = 4.0 * f64::from(self.shape.inputs() + self.shape.hidden + self.shape.grid.outputs());
-        rec.run(&self.backward, Work::items(u64::from(n)).flops(2.0 * self.hidden_flops()).bytes(bytes), args);
-        self.hidden_gradient.gradient(rec, params, buffers.inputs.ptr(), n, scratch.d_preactivation.ptr(), n);
+        let bytes =
+            4.0 * f64::from(self.shape.inputs() + self.shape.hidden + self.shape.grid.outputs());
+        rec.run(
+            &self.backward,
+            Work::items(u64::from(n))
+                .flops(2.0 * self.hidden_flops())
+                .bytes(bytes),
+            args,
+        );
+        self.hidden_gradient.gradient(
+            rec,
+            params,
+            buffers.inputs.ptr(),
+            n,
+            scratch.d_preactivation.ptr(),
+            n,
+        );
         let args = hash_grid_backward::Args {
             levels: self.levels.ptr(),
             points,
@@ -194,7 +241,9 @@ impl Field {
             n,
         };
         let levels = self.shape.grid.levels;
-        let work = Work::items(u64::from(n)).slices(levels).flops(2.0 * 8.0 * f64::from(self.shape.grid.outputs()));
+        let work = Work::items(u64::from(n))
+            .slices(levels)
+            .flops(2.0 * 8.0 * f64::from(self.shape.grid.outputs()));
         rec.run(&self.scatter, work.bytes(2.0 * self.gather_bytes()), args);
     }
 }

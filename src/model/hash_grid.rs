@@ -48,7 +48,10 @@ impl HashGrid {
 
     /// Entries of all levels together.
     pub fn entries(&self) -> u64 {
-        self.level_table().iter().map(|l| u64::from(l.entries)).sum()
+        self.level_table()
+            .iter()
+            .map(|l| u64::from(l.entries))
+            .sum()
     }
 
     /// Length of an encoded position.
@@ -63,17 +66,51 @@ mod tests {
 
     #[test]
     fn published_level_tables() {
-        let resolutions = |grid: HashGrid| grid.level_table().iter().map(|l| l.resolution).collect::<Vec<_>>();
-        let sdf = HashGrid { levels: 16, base: 32, max: 2048, log2_size: 19, features: 8 };
-        assert_eq!(resolutions(sdf), [32, 43, 56, 74, 98, 129, 169, 223, 295, 389, 513, 676, 892, 1177, 1553, 2049]);
+        let resolutions = |grid: HashGrid| {
+            grid.level_table()
+                .iter()
+                .map(|l| l.resolution)
+                .collect::<Vec<_>>()
+        };
+        let sdf = HashGrid {
+            levels: 16,
+            base: 32,
+            max: 2048,
+            log2_size: 19,
+            features: 8,
+        };
+        assert_eq!(
+            resolutions(sdf),
+            [
+                32, 43, 56, 74, 98, 129, 169, 223, 295, 389, 513, 676, 892, 1177, 1553, 2049
+            ]
+        );
         assert_eq!(sdf.entries(), 6_984_576);
-        let sdf22 = HashGrid { log2_size: 22, ..sdf };
+        let sdf22 = HashGrid {
+            log2_size: 22,
+            ..sdf
+        };
         assert_eq!(sdf22.entries(), 45_724_048);
-        assert_eq!(sdf22.level_table().iter().filter(|l| l.hashed == 0).count(), 6);
-        let proposal = |max| HashGrid { levels: 5, base: 16, max, log2_size: 17, features: 2 };
+        assert_eq!(
+            sdf22.level_table().iter().filter(|l| l.hashed == 0).count(),
+            6
+        );
+        let proposal = |max| HashGrid {
+            levels: 5,
+            base: 16,
+            max,
+            log2_size: 17,
+            features: 2,
+        };
         assert_eq!(resolutions(proposal(64))[..4], [16, 23, 32, 46]);
         assert_eq!(resolutions(proposal(256)), [16, 32, 64, 128, 256]);
-        let background = HashGrid { levels: 16, base: 16, max: 1024, log2_size: 19, features: 2 };
+        let background = HashGrid {
+            levels: 16,
+            base: 16,
+            max: 1024,
+            log2_size: 19,
+            features: 2,
+        };
         assert_eq!(resolutions(background)[..6], [16, 22, 28, 37, 49, 65]);
         assert_eq!(background.entries() * 2, 11_445_040);
     }

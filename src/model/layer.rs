@@ -66,7 +66,10 @@ impl Layer {
                 tile: tile(shape.backward_inputs),
                 ..base
             };
-            Some((shape.backward_inputs, gpu.kernel(adjoint)?.labelled(&format!("{label} backward"))))
+            Some((
+                shape.backward_inputs,
+                gpu.kernel(adjoint)?.labelled(&format!("{label} backward")),
+            ))
         } else {
             None
         };
@@ -78,7 +81,11 @@ impl Layer {
             forward: gpu.kernel(base)?.labelled(&format!("{label} forward")),
             backward,
             gradient: gpu
-                .kernel(weight_gradient::Shape { inputs: shape.inputs, outputs: shape.outputs, bias })?
+                .kernel(weight_gradient::Shape {
+                    inputs: shape.inputs,
+                    outputs: shape.outputs,
+                    bias,
+                })?
                 .labelled(label),
         })
     }
@@ -100,7 +107,14 @@ impl Layer {
     }
 
     /// `y [outputs, n]` from `x [inputs, n]`.
-    pub fn forward(&self, rec: &mut Recorder, params: &Params, x: Ptr<f32>, y: PtrMut<f32>, n: u32) {
+    pub fn forward(
+        &self,
+        rec: &mut Recorder,
+        params: &Params,
+        x: Ptr<f32>,
+        y: PtrMut<f32>,
+        n: u32,
+    ) {
         let args = linear::Args {
             x,
             weight: params.weight(self.handle, self.weight_offset()),
@@ -113,8 +127,19 @@ impl Layer {
     }
 
     /// `d_x [backward_inputs, n]` from the gradient `d_y [outputs, n]` before the activation; `x` gates it where the inputs are ReLU's.
-    pub fn backward(&self, rec: &mut Recorder, params: &Params, d_y: Ptr<f32>, x: Ptr<f32>, d_x: PtrMut<f32>, n: u32) {
-        let (outputs, kernel) = self.backward.as_ref().expect("a layer built without input gradients was asked for them");
+    pub fn backward(
+        &self,
+        rec: &mut Recorder,
+        params: &Params,
+        d_y: Ptr<f32>,
+        x: Ptr<f32>,
+        d_x: PtrMut<f32>,
+        n: u32,
+    ) {
+        let (outputs, kernel) = self
+            .backward
+            .as_ref()
+            .expect("a layer built without input gradients was asked for them");
         let args = linear::Args {
             x: d_y,
             weight: params.weight(self.handle, self.weight_offset()),
@@ -127,7 +152,15 @@ impl Layer {
     }
 
     /// Adds the gradients of weights and bias, from `x` (channels `stride_x` apart) and `d_y [outputs, n]`.
-    pub fn gradient(&self, rec: &mut Recorder, params: &Params, x: Ptr<f32>, stride_x: u32, d_y: Ptr<f32>, n: u32) {
+    pub fn gradient(
+        &self,
+        rec: &mut Recorder,
+        params: &Params,
+        x: Ptr<f32>,
+        stride_x: u32,
+        d_y: Ptr<f32>,
+        n: u32,
+    ) {
         let args = weight_gradient::Args {
             x,
             d_y,
@@ -141,7 +174,10 @@ impl Layer {
         let groups = u64::from(n.div_ceil(GRADIENT_CHUNK));
         let work = Work::items(groups * 64)
             .slices(columns.div_ceil(8) * self.outputs.div_ceil(8))
-            .flops(2.0 * f64::from(columns) * f64::from(self.outputs) * f64::from(GRADIENT_CHUNK) / 64.0)
+            .flops(
+                2.0 * f64::from(columns) * f64::from(self.outputs) * f64::from(GRADIENT_CHUNK)
+                    / 64.0,
+            )
             .bytes(4.0 * f64::from(columns + self.outputs) * f64::from(GRADIENT_CHUNK) / 64.0);
         rec.run(&self.gradient, work, args);
     }

@@ -83,13 +83,27 @@ const ALIGNMENT: u64 = 8;
 impl ParamsPlan {
     /// Adds a span and returns its element offset. Spans of one group must be added in one go.
     pub fn add(&mut self, group: Group, name: impl Into<String>, shape: &[u64], init: Init) -> u64 {
-        let span = Span { name: name.into(), group, first: self.len, shape: shape.to_vec() };
+        let span = Span {
+            name: name.into(),
+            group,
+            first: self.len,
+            shape: shape.to_vec(),
+        };
         if let Init::Values(values) = &init {
-            assert_eq!(values.len() as u64, span.len(), "initial values of {}", span.name);
+            assert_eq!(
+                values.len() as u64,
+                span.len(),
+                "initial values of {}",
+                span.name
+            );
         }
         if let Some((last, _)) = self.spans.last() {
             let reopened = last.group != group && self.spans.iter().any(|(s, _)| s.group == group);
-            assert!(!reopened, "group {group:?} of {} is not contiguous", span.name);
+            assert!(
+                !reopened,
+                "group {group:?} of {} is not contiguous",
+                span.name
+            );
         }
         self.len = (self.len + span.len()).next_multiple_of(ALIGNMENT);
         let first = span.first;
@@ -98,13 +112,30 @@ impl ParamsPlan {
     }
 
     /// Adds a weight-normalised matrix `[rows, columns]` (spans `name.v`, `name.g`, `name.bias`); g starts as ‖v‖.
-    pub fn add_normalised(&mut self, group: Group, name: &str, columns: u64, v: Vec<f32>, bias: Vec<f32>) -> WeightHandle {
+    pub fn add_normalised(
+        &mut self,
+        group: Group,
+        name: &str,
+        columns: u64,
+        v: Vec<f32>,
+        bias: Vec<f32>,
+    ) -> WeightHandle {
         let rows = bias.len() as u64;
         let lengths: Vec<f32> = v
             .chunks(columns as usize)
-            .map(|row| row.iter().map(|&x| f64::from(x) * f64::from(x)).sum::<f64>().sqrt() as f32)
+            .map(|row| {
+                row.iter()
+                    .map(|&x| f64::from(x) * f64::from(x))
+                    .sum::<f64>()
+                    .sqrt() as f32
+            })
             .collect();
-        let v_first = self.add(group, format!("{name}.v"), &[rows, columns], Init::Values(v));
+        let v_first = self.add(
+            group,
+            format!("{name}.v"),
+            &[rows, columns],
+            Init::Values(v),
+        );
         let g_first = self.add(group, format!("{name}.g"), &[rows], Init::Values(lengths));
         let bias_first = self.add(group, format!("{name}.bias"), &[rows], Init::Values(bias));
         let weight = self.effective_len;
@@ -117,13 +148,26 @@ impl ParamsPlan {
             });
         }
         self.effective_len = (weight + rows * columns).next_multiple_of(ALIGNMENT);
-        WeightHandle { weight: WeightAt::Normalised(weight), bias: Some(bias_first) }
+        WeightHandle {
+            weight: WeightAt::Normalised(weight),
+            bias: Some(bias_first),
+        }
     }
 
     /// Adds a plain matrix without bias.
-    pub fn add_plain(&mut self, group: Group, name: &str, rows: u64, columns: u64, values: Vec<f32>) -> WeightHandle {
+    pub fn add_plain(
+        &mut self,
+        group: Group,
+        name: &str,
+        rows: u64,
+        columns: u64,
+        values: Vec<f32>,
+    ) -> WeightHandle {
         let first = self.add(group, name, &[rows, columns], Init::Values(values));
-        WeightHandle { weight: WeightAt::Plain(first), bias: None }
+        WeightHandle {
+            weight: WeightAt::Plain(first),
+            bias: None,
+        }
     }
 
     /// Elements in the block.
@@ -142,7 +186,9 @@ impl ParamsPlan {
         for (span, init) in &self.spans {
             match init {
                 Init::Values(v) => gpu.upload(&values, span.first, v)?,
-                Init::Uniform { half_range } => upload_uniform(gpu, &values, span, *half_range, seed)?,
+                Init::Uniform { half_range } => {
+                    upload_uniform(gpu, &values, span, *half_range, seed)?
+                }
             }
         }
         let row_table = gpu.buffer::<WeightRow>("weight rows", self.rows.len().max(1) as u64)?;
@@ -164,13 +210,20 @@ impl ParamsPlan {
 }
 
 /// Draws a span's values in pieces, so that a table of gigabytes needs no second copy on the host.
-fn upload_uniform(gpu: &Gpu, values: &Buffer<f32>, span: &Span, half_range: f32, seed: u32) -> Result<()> {
+fn upload_uniform(
+    gpu: &Gpu,
+    values: &Buffer<f32>,
+    span: &Span,
+    half_range: f32,
+    seed: u32,
+) -> Result<()> {
     const PIECE: u64 = 1 << 22;
     let mut first = 0;
     while first < span.len() {
         let count = PIECE.min(span.len() - first);
-        let piece: Vec<f32> =
-            (first..first + count).map(|i| (2.0 * uniform(seed, span.first + i) - 1.0) as f32 * half_range).collect();
+        let piece: Vec<f32> = (first..first + count)
+            .map(|i| (2.0 * uniform(seed, span.first + i) - 1.0) as f32 * half_range)
+            .collect();
         gpu.upload(values, span.first + first, &piece)?;
         first += count;
     }
@@ -179,7 +232,10 @@ fn upload_uniform(gpu: &Gpu, values: &Buffer<f32>, span: &Span, half_range: f32,
 
 /// A uniform in [0, 1) as a function of (seed, index): SplitMix64's finaliser on their combination (Steele et al. 2014).
 pub(super) fn uniform(seed: u32, index: u64) -> f64 {
-    let mut x = index.wrapping_add(u64::from(seed) << 40).wrapping_add(1).wrapping_mul(0x9e37_79b9_7f4a_7c15);
+    let mut x = index
+        .wrapping_add(u64::from(seed) << 40)
+        .wrapping_add(1)
+        .wrapping_mul(0x9e37_79b9_7f4a_7c15);
     x = (x ^ (x >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
     x = (x ^ (x >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
     ((x ^ (x >> 31)) >> 11) as f64 / (1u64 << 53) as f64
@@ -194,7 +250,9 @@ pub(super) struct Draws {
 impl Draws {
     /// A sequence of its own for each purpose.
     pub(super) fn new(seed: u32, purpose: &str) -> Self {
-        let hash = purpose.bytes().fold(0xcbf2_9ce4_8422_2325u64, |h, b| (h ^ u64::from(b)).wrapping_mul(0x0100_0000_01b3));
+        let hash = purpose.bytes().fold(0xcbf2_9ce4_8422_2325u64, |h, b| {
+            (h ^ u64::from(b)).wrapping_mul(0x0100_0000_01b3)
+        });
         Draws { seed, next: hash }
     }
 
@@ -302,11 +360,15 @@ impl Params {
 
     /// Bias values (any valid address where the layer has none; its kernels do not look).
     pub fn bias(&self, handle: WeightHandle, offset: u64) -> Ptr<f32> {
-        self.values.ptr().offset(handle.bias.map_or(0, |first| first + offset))
+        self.values
+            .ptr()
+            .offset(handle.bias.map_or(0, |first| first + offset))
     }
 
     /// Where the bias's gradient is accumulated.
     pub fn d_bias(&self, handle: WeightHandle, offset: u64) -> PtrMut<f32> {
-        self.grads.ptr_mut().offset(handle.bias.map_or(0, |first| first + offset))
+        self.grads
+            .ptr_mut()
+            .offset(handle.bias.map_or(0, |first| first + offset))
     }
 }

@@ -16,11 +16,11 @@ pub struct Proposal {
 /// A proposal level's samples for a batch of rays.
 pub struct ProposalBuffers {
     pub field: FieldBuffers,
-    pub edges: Buffer<f32>,   // [n_rays, n_samples + 1] normalised s
-    pub points: Buffer<f32>,  // [3, n] bin midpoints
-    pub raw: Buffer<f32>,     // [n] log density
-    pub d_raw: Buffer<f32>,   // [n]
-    pub weights: Buffer<f32>, // [n_rays, n_samples]
+    pub edges: Buffer<f32>,      // [n_rays, n_samples + 1] normalised s
+    pub points: Buffer<f32>,     // [3, n] bin midpoints
+    pub raw: Buffer<f32>,        // [n] log density
+    pub d_raw: Buffer<f32>,      // [n]
+    pub weights: Buffer<f32>,    // [n_rays, n_samples]
     pub cumulative: Buffer<f32>, // [n_rays, n_samples + 1] scratch of resampling and of the interlevel loss
 }
 
@@ -35,17 +35,29 @@ impl Proposal {
             log2_size: s.proposal_log2_size,
             features: s.proposal_features,
         };
-        FieldShape { grid, hidden: s.proposal_hidden, coordinates: false, softplus: false }
+        FieldShape {
+            grid,
+            hidden: s.proposal_hidden,
+            coordinates: false,
+            softplus: false,
+        }
     }
 
     /// Adds the parameters of level 0 or 1 and builds its kernels.
-    pub fn new(gpu: &Gpu, config: &Config, plan: &mut ParamsPlan, level: usize) -> Result<Proposal> {
+    pub fn new(
+        gpu: &Gpu,
+        config: &Config,
+        plan: &mut ParamsPlan,
+        level: usize,
+    ) -> Result<Proposal> {
         let shape = Self::field_shape(config, level);
         let name = format!("proposal.{level}");
         let mut draws = Draws::new(config.seed, &name);
         let mut matrix = |rows: u32, columns: u32| -> Vec<f32> {
             let bound = 1.0 / f64::from(columns).sqrt();
-            (0..rows * columns).map(|_| draws.symmetric(bound)).collect()
+            (0..rows * columns)
+                .map(|_| draws.symmetric(bound))
+                .collect()
         };
         let (hidden, inputs) = (shape.hidden, shape.inputs());
         let table = plan.add(
@@ -55,10 +67,21 @@ impl Proposal {
             Init::Uniform { half_range: 1e-4 },
         );
         let hidden_weight = matrix(hidden, inputs);
-        let hidden_handle =
-            plan.add_plain(Group::Proposal, &format!("{name}.hidden"), u64::from(hidden), u64::from(inputs), hidden_weight);
+        let hidden_handle = plan.add_plain(
+            Group::Proposal,
+            &format!("{name}.hidden"),
+            u64::from(hidden),
+            u64::from(inputs),
+            hidden_weight,
+        );
         let out_weight = matrix(1, hidden);
-        let out_handle = plan.add_plain(Group::Proposal, &format!("{name}.out"), 1, u64::from(hidden), out_weight);
+        let out_handle = plan.add_plain(
+            Group::Proposal,
+            &format!("{name}.out"),
+            1,
+            u64::from(hidden),
+            out_weight,
+        );
         Ok(Proposal {
             field: Field::new(gpu, &name, shape, table, hidden_handle, out_handle)?,
             n_samples: config.sampling.proposal_samples[level],
@@ -83,11 +106,25 @@ impl Proposal {
 
     /// Log density at the bin midpoints.
     pub fn forward(&self, rec: &mut Recorder, params: &Params, b: &ProposalBuffers) {
-        self.field.forward(rec, params, b.points.ptr(), &b.field, b.raw.ptr_mut());
+        self.field
+            .forward(rec, params, b.points.ptr(), &b.field, b.raw.ptr_mut());
     }
 
     /// Adds all gradients, from `b.d_raw`.
-    pub fn backward(&self, rec: &mut Recorder, params: &Params, b: &ProposalBuffers, scratch: &Scratch) {
-        self.field.backward(rec, params, b.points.ptr(), b.d_raw.ptr(), &b.field, scratch);
+    pub fn backward(
+        &self,
+        rec: &mut Recorder,
+        params: &Params,
+        b: &ProposalBuffers,
+        scratch: &Scratch,
+    ) {
+        self.field.backward(
+            rec,
+            params,
+            b.points.ptr(),
+            b.d_raw.ptr(),
+            &b.field,
+            scratch,
+        );
     }
 }

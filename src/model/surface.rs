@@ -28,17 +28,17 @@ pub struct Surface {
 /// Activations of the surface at `n` samples and their six taps.
 pub struct SurfaceBuffers {
     pub n: u32,
-    pub points: Buffer<f32>,    // [3, 7n] samples, then taps +x −x +y −y +z −z
-    pub field: FieldBuffers,    // of the 7n points
-    pub sdf: Buffer<f32>,       // [7, n]
-    pub d_sdf: Buffer<f32>,     // [7, n]
-    pub shading: Buffer<f32>,   // [rows, n] glsl/lib/shading.glsl; row 0 is the scale logit
+    pub points: Buffer<f32>,  // [3, 7n] samples, then taps +x −x +y −y +z −z
+    pub field: FieldBuffers,  // of the 7n points
+    pub sdf: Buffer<f32>,     // [7, n]
+    pub d_sdf: Buffer<f32>,   // [7, n]
+    pub shading: Buffer<f32>, // [rows, n] glsl/lib/shading.glsl; row 0 is the scale logit
     pub d_shading: Buffer<f32>, // [rows that receive gradients, n]
     pub hidden: Vec<Buffer<f32>>, // per hidden colour layer [width, n]
     pub d_hidden: Vec<Buffer<f32>>,
-    pub rgb: Buffer<f32>,       // [3, n] sigmoid output, not padded
-    pub d_rgb: Buffer<f32>,     // [3, n]
-    pub eikonal: Buffer<f32>,   // [n]
+    pub rgb: Buffer<f32>,     // [3, n] sigmoid output, not padded
+    pub d_rgb: Buffer<f32>,   // [3, n]
+    pub eikonal: Buffer<f32>, // [n]
 }
 
 /// Samples' companions that shading reads.
@@ -62,7 +62,12 @@ impl Surface {
             log2_size: hash.log2_size,
             features: hash.features,
         };
-        FieldShape { grid, hidden: config.surface.hidden, coordinates: true, softplus: true }
+        FieldShape {
+            grid,
+            hidden: config.surface.hidden,
+            coordinates: true,
+            softplus: true,
+        }
     }
 
     /// Adds the parameters with NeuRodin's geometric initialisation and builds the kernels. `views` counts appearance codes.
@@ -75,20 +80,39 @@ impl Surface {
         // f ≈ ‖x‖ − r; mirrored where free space is inside.
         let mut draws = Draws::new(config.seed, "surface");
         let deviation = (2.0 / f64::from(hidden)).sqrt();
-        let v = (0..hidden * inputs).map(|i| if i % inputs < 3 { draws.normal(0.0, deviation) } else { 0.0 }).collect();
-        let hidden_weight =
-            plan.add_normalised(Group::Fields, "surface.hidden", u64::from(inputs), v, vec![0.0; hidden as usize]);
+        let v = (0..hidden * inputs)
+            .map(|i| {
+                if i % inputs < 3 {
+                    draws.normal(0.0, deviation)
+                } else {
+                    0.0
+                }
+            })
+            .collect();
+        let hidden_weight = plan.add_normalised(
+            Group::Fields,
+            "surface.hidden",
+            u64::from(inputs),
+            v,
+            vec![0.0; hidden as usize],
+        );
         let sign = if config.surface.inside_out { -1.0 } else { 1.0 };
         let mean = sign * (std::f64::consts::PI / f64::from(hidden)).sqrt();
         let rows = 2 + geometry;
-        let v = (0..rows * hidden).map(|_| draws.normal(mean, 1e-4)).collect();
+        let v = (0..rows * hidden)
+            .map(|_| draws.normal(mean, 1e-4))
+            .collect();
         let bias = vec![(-sign * config.surface.init_bias) as f32; rows as usize];
-        let heads_weight = plan.add_normalised(Group::Fields, "surface.heads", u64::from(hidden), v, bias);
+        let heads_weight =
+            plan.add_normalised(Group::Fields, "surface.heads", u64::from(hidden), v, bias);
 
         let appearance_dims = config.appearance.dims;
         let color_inputs = geometry + 3 + appearance_dims + 3 + DIRECTION_ENCODING;
         let widths: Vec<u32> = std::iter::once(color_inputs)
-            .chain(std::iter::repeat_n(config.color.hidden, config.color.layers as usize))
+            .chain(std::iter::repeat_n(
+                config.color.hidden,
+                config.color.layers as usize,
+            ))
             .chain([3])
             .collect();
         let mut draws = Draws::new(config.seed, "color");
@@ -106,14 +130,24 @@ impl Surface {
                 inputs: n_in,
                 outputs: n_out,
                 first_row: 0,
-                activation: if last { Activation::Sigmoid } else { Activation::Relu },
-                backward_inputs: if layer == 0 { geometry + 3 + appearance_dims } else { n_in },
+                activation: if last {
+                    Activation::Sigmoid
+                } else {
+                    Activation::Relu
+                },
+                backward_inputs: if layer == 0 {
+                    geometry + 3 + appearance_dims
+                } else {
+                    n_in
+                },
                 inputs_are_relu: layer > 0,
             };
             colors.push(Layer::new(gpu, &name, shape, handle)?);
         }
         let mut draws = Draws::new(config.seed, "appearance");
-        let codes = (0..views * appearance_dims).map(|_| draws.normal(0.0, 1.0)).collect();
+        let codes = (0..views * appearance_dims)
+            .map(|_| draws.normal(0.0, 1.0))
+            .collect();
         let appearance = plan.add(
             Group::Fields,
             "appearance",
@@ -143,8 +177,14 @@ impl Surface {
             appearance,
             appearance_dims,
             geometry,
-            shade_forward: gpu.kernel(shade_forward::Shape { geometry, appearance: appearance_dims })?,
-            shade_backward: gpu.kernel(shade_backward::Shape { geometry, appearance: appearance_dims })?,
+            shade_forward: gpu.kernel(shade_forward::Shape {
+                geometry,
+                appearance: appearance_dims,
+            })?,
+            shade_backward: gpu.kernel(shade_backward::Shape {
+                geometry,
+                appearance: appearance_dims,
+            })?,
             sigmoid_backward: gpu.kernel(sigmoid_backward::Shape::default())?,
             appearance_backward: gpu.kernel(appearance_backward::Shape::default())?,
             tap_range: config.surface.tap_range as f32,
@@ -167,7 +207,9 @@ impl Surface {
         let width = |layer: usize| self.colors[layer].outputs();
         let hidden_layers = self.colors.len() - 1;
         let layer_buffers = |name: &str| -> Result<Vec<Buffer<f32>>> {
-            (0..hidden_layers).map(|l| gpu.scratch(&format!("{name} {l}"), u64::from(width(l)) * n64)).collect()
+            (0..hidden_layers)
+                .map(|l| gpu.scratch(&format!("{name} {l}"), u64::from(width(l)) * n64))
+                .collect()
         };
         let rows = u64::from(self.gradient_rows() + 3 + DIRECTION_ENCODING);
         Ok(SurfaceBuffers {
@@ -187,9 +229,17 @@ impl Surface {
     }
 
     /// SDF at samples and taps, scale logit, gradient and colour of the samples in `b.points`.
-    pub fn forward(&self, rec: &mut Recorder, params: &Params, b: &SurfaceBuffers, inputs: &ShadeInputs) {
-        self.field.forward(rec, params, b.points.ptr(), &b.field, b.sdf.ptr_mut());
-        self.heads.forward(rec, params, b.field.hidden.ptr(), b.shading.ptr_mut(), b.n);
+    pub fn forward(
+        &self,
+        rec: &mut Recorder,
+        params: &Params,
+        b: &SurfaceBuffers,
+        inputs: &ShadeInputs,
+    ) {
+        self.field
+            .forward(rec, params, b.points.ptr(), &b.field, b.sdf.ptr_mut());
+        self.heads
+            .forward(rec, params, b.field.hidden.ptr(), b.shading.ptr_mut(), b.n);
         let args = shade_forward::Args {
             sdf: b.sdf.ptr(),
             tap_draws: inputs.tap_draws,
@@ -204,7 +254,11 @@ impl Surface {
             tap_range: self.tap_range,
             tap_floor: self.tap_floor,
         };
-        rec.run(&self.shade_forward, Work::items(u64::from(b.n)).flops(200.0).bytes(200.0), args);
+        rec.run(
+            &self.shade_forward,
+            Work::items(u64::from(b.n)).flops(200.0).bytes(200.0),
+            args,
+        );
         let mut x = self.color_inputs(b);
         for (layer, color) in self.colors.iter().enumerate() {
             let y = b.hidden.get(layer).unwrap_or(&b.rgb);
@@ -215,17 +269,29 @@ impl Surface {
 
     /// Adds all gradients, from `b.d_rgb`, `b.d_sdf` block 0 and the logit's row 0 of `b.d_shading`. `eikonal_scale` is λ/B.
     pub fn backward(
-        &self, rec: &mut Recorder, params: &Params, b: &SurfaceBuffers, scratch: &Scratch, inputs: &ShadeInputs,
+        &self,
+        rec: &mut Recorder,
+        params: &Params,
+        b: &SurfaceBuffers,
+        scratch: &Scratch,
+        inputs: &ShadeInputs,
         eikonal_scale: f32,
     ) {
         let n = b.n;
         let work = Work::items(3 * u64::from(n));
-        let args = sigmoid_backward::Args { y: b.rgb.ptr(), d_y: b.d_rgb.ptr_mut(), n: 3 * n };
+        let args = sigmoid_backward::Args {
+            y: b.rgb.ptr(),
+            d_y: b.d_rgb.ptr_mut(),
+            n: 3 * n,
+        };
         rec.run(&self.sigmoid_backward, work, args);
         let mut d_y = b.d_rgb.ptr();
         for (layer, color) in self.colors.iter().enumerate().rev() {
             let (x, d_x) = match layer {
-                0 => (self.color_inputs(b), b.d_shading.ptr_mut().offset(u64::from(n))),
+                0 => (
+                    self.color_inputs(b),
+                    b.d_shading.ptr_mut().offset(u64::from(n)),
+                ),
                 _ => (b.hidden[layer - 1].ptr(), b.d_hidden[layer - 1].ptr_mut()),
             };
             color.gradient(rec, params, x, n, d_y, n);
@@ -242,26 +308,57 @@ impl Surface {
             tap_floor: self.tap_floor,
             eikonal_scale,
         };
-        rec.run(&self.shade_backward, Work::items(u64::from(n)).flops(30.0).bytes(56.0), args);
+        rec.run(
+            &self.shade_backward,
+            Work::items(u64::from(n)).flops(30.0).bytes(56.0),
+            args,
+        );
         if self.appearance_dims > 0 {
             let args = appearance_backward::Args {
-                d_code: b.d_shading.ptr().offset(u64::from(1 + self.geometry + 3) * u64::from(n)),
+                d_code: b
+                    .d_shading
+                    .ptr()
+                    .offset(u64::from(1 + self.geometry + 3) * u64::from(n)),
                 ray_view: inputs.ray_view,
                 d_appearance: params.grads().ptr_mut().offset(self.appearance),
                 n_rays: inputs.n_rays,
                 n_samples: n / inputs.n_rays,
                 channels: self.appearance_dims,
             };
-            rec.run(&self.appearance_backward, Work::items(u64::from(inputs.n_rays * self.appearance_dims)), args);
+            rec.run(
+                &self.appearance_backward,
+                Work::items(u64::from(inputs.n_rays * self.appearance_dims)),
+                args,
+            );
         }
         let hidden = b.field.hidden.ptr();
-        self.heads.gradient(rec, params, hidden, n, b.d_shading.ptr(), n);
-        self.heads.backward(rec, params, b.d_shading.ptr(), hidden, b.field.d_hidden.ptr_mut(), n);
-        self.field.backward(rec, params, b.points.ptr(), b.d_sdf.ptr(), &b.field, scratch);
+        self.heads
+            .gradient(rec, params, hidden, n, b.d_shading.ptr(), n);
+        self.heads.backward(
+            rec,
+            params,
+            b.d_shading.ptr(),
+            hidden,
+            b.field.d_hidden.ptr_mut(),
+            n,
+        );
+        self.field.backward(
+            rec,
+            params,
+            b.points.ptr(),
+            b.d_sdf.ptr(),
+            &b.field,
+            scratch,
+        );
     }
 
     fn color_inputs(&self, b: &SurfaceBuffers) -> Ptr<f32> {
         b.shading.ptr().offset(u64::from(b.n))
+    }
+
+    /// Element of `shading` at which the gradient's three rows begin.
+    pub fn gradient_row(&self, b: &SurfaceBuffers) -> u64 {
+        u64::from(1 + self.geometry) * u64::from(b.n)
     }
 
     /// Where row 0 of the shading gradients, the scale logit's, is to be written.
