@@ -14,7 +14,11 @@ use reference::trial::{self, Random};
 /// are, so differences of the surface's parameters must leave it out; the proposal networks have no other loss.
 fn objective(outcome: &Outcome, span: &str) -> f64 {
     let interlevel = outcome.losses["interlevel"];
-    if span.starts_with("proposal") { interlevel } else { outcome.losses["total"] - interlevel }
+    if span.starts_with("proposal") {
+        interlevel
+    } else {
+        outcome.losses["total"] - interlevel
+    }
 }
 
 /// Compares sampled gradients of every span with central differences of step 1e-6, at fixed sample positions (no gradient flows
@@ -29,9 +33,17 @@ fn check_gradients(mut step: Step, seed: u64) {
     let spans: Vec<String> = step.params.keys().cloned().collect();
     for span in spans {
         let gradient = &outcome.gradients[&span];
-        let touched: Vec<usize> = (0..gradient.len()).filter(|&i| gradient[i] != 0.0).collect();
+        let touched: Vec<usize> = (0..gradient.len())
+            .filter(|&i| gradient[i] != 0.0)
+            .collect();
         assert!(!touched.is_empty(), "{span} has no gradient");
-        let largest = (0..gradient.len()).fold(0, |best, i| if gradient[i].abs() > gradient[best].abs() { i } else { best });
+        let largest = (0..gradient.len()).fold(0, |best, i| {
+            if gradient[i].abs() > gradient[best].abs() {
+                i
+            } else {
+                best
+            }
+        });
         let some = |random: &mut Random, n: usize| (random.uniform() * n as f64) as usize;
         let mut sampled = vec![largest, some(random, gradient.len())];
         sampled.extend((0..4).map(|_| touched[some(random, touched.len())]));
@@ -44,22 +56,33 @@ fn check_gradients(mut step: Step, seed: u64) {
             let difference = (at(value + 1e-6) - at(value - 1e-6)) / 2e-6;
             at(value);
             let error = (difference - gradient[i]).abs();
-            let allowed = 1e-3 * gradient[i].abs() + (1e-4 * gradient[largest].abs()).min(1e-5).max(1e-9);
-            assert!(error <= allowed, "{span}[{i}]: gradient {}, central difference {difference}", gradient[i]);
+            let allowed =
+                1e-3 * gradient[i].abs() + (1e-4 * gradient[largest].abs()).clamp(1e-9, 1e-5);
+            assert!(
+                error <= allowed,
+                "{span}[{i}]: gradient {}, central difference {difference}",
+                gradient[i]
+            );
         }
     }
 }
 
 #[test]
 fn gradients_outdoors_with_one_background_color() {
-    check_gradients(trial::step(trial::config(), 16, 1), 2);
+    check_gradients(trial::step(trial::config(), 24, 1), 2);
 }
 
 #[test]
 fn gradients_outdoors_with_a_background_field() {
     for contraction in [true, false] {
-        let field = background::FieldConfig { contraction, ..trial::background_field() };
-        let config = reference::batch::StepConfig { background: Background::Field(field), ..trial::config() };
+        let field = background::FieldConfig {
+            contraction,
+            ..trial::background_field()
+        };
+        let config = reference::batch::StepConfig {
+            background: Background::Field(field),
+            ..trial::config()
+        };
         check_gradients(trial::step(config, 16, 3), 4);
     }
 }
@@ -67,7 +90,9 @@ fn gradients_outdoors_with_a_background_field() {
 #[test]
 fn gradients_indoors() {
     let config = reference::batch::StepConfig {
-        region: Region::Box { half: [1.0, 0.7, 0.8] },
+        region: Region::Box {
+            half: [1.0, 0.7, 0.8],
+        },
         background: Background::Black,
         bias_needs_opaque: false,
         bias_reduction: BiasReduction::Published,
@@ -89,24 +114,47 @@ fn masked_rays_have_no_color_loss() {
     let mut step = trial::step(trial::config(), 6, 7);
     let all = step.run();
     let half: f64 = all.images.color_error[..3].iter().sum::<f64>() / 3.0;
-    step.rays.target[3..].iter_mut().for_each(|target| target[3] = 0.0);
+    step.rays.target[3..]
+        .iter_mut()
+        .for_each(|target| target[3] = 0.0);
     step.now.inv_count = 1.0 / 3.0;
     assert!((step.run().losses["color"] - half).abs() < 1e-14);
 }
 
 #[test]
 fn published_level_tables() {
-    let resolutions = |grid: Grid| grid.levels.iter().map(|level| level.resolution).collect::<Vec<_>>();
+    let resolutions = |grid: Grid| {
+        grid.levels
+            .iter()
+            .map(|level| level.resolution)
+            .collect::<Vec<_>>()
+    };
     let surface = Grid::published(16, 32, 2048, 19, 8);
     assert_eq!(surface.entries(), 6_984_576);
     assert_eq!(surface.parameters(), 55_876_608);
-    assert_eq!(resolutions(surface), [32, 43, 56, 74, 98, 129, 169, 223, 295, 389, 513, 676, 892, 1177, 1553, 2049]);
+    assert_eq!(
+        resolutions(surface),
+        [
+            32, 43, 56, 74, 98, 129, 169, 223, 295, 389, 513, 676, 892, 1177, 1553, 2049
+        ]
+    );
     let surface = Grid::published(16, 32, 2048, 22, 8);
     assert_eq!(surface.entries(), 45_724_048);
     assert_eq!(surface.levels.iter().filter(|level| level.dense).count(), 6);
-    let entries = |grid: Grid| grid.levels.iter().map(|level| level.entries).collect::<Vec<_>>();
-    assert_eq!(entries(Grid::published(5, 16, 64, 17, 2)), [4096, 12168, 32768, 97336, 131_072]);
-    assert_eq!(entries(Grid::published(5, 16, 256, 17, 2)), [4096, 32768, 131_072, 131_072, 131_072]);
+    let entries = |grid: Grid| {
+        grid.levels
+            .iter()
+            .map(|level| level.entries)
+            .collect::<Vec<_>>()
+    };
+    assert_eq!(
+        entries(Grid::published(5, 16, 64, 17, 2)),
+        [4096, 12168, 32768, 97336, 131_072]
+    );
+    assert_eq!(
+        entries(Grid::published(5, 16, 256, 17, 2)),
+        [4096, 32768, 131_072, 131_072, 131_072]
+    );
     let background = Grid::published(16, 16, 1024, 19, 2);
     assert_eq!(background.parameters(), 11_445_040);
     assert_eq!(resolutions(background)[..6], [16, 22, 28, 37, 49, 65]);
@@ -114,9 +162,17 @@ fn published_level_tables() {
 
 #[test]
 fn exact_scales_and_published_ones_agree_to_single_precision() {
-    let (exact, published) = (Grid::exact(12, 16, 1024, 17, 2), Grid::published(12, 16, 1024, 17, 2));
+    let (exact, published) = (
+        Grid::exact(12, 16, 1024, 17, 2),
+        Grid::published(12, 16, 1024, 17, 2),
+    );
     for (a, b) in exact.levels.iter().zip(&published.levels) {
-        assert!((a.scale - b.scale).abs() <= 1e-6 * a.scale, "{} and {}", a.scale, b.scale);
+        assert!(
+            (a.scale - b.scale).abs() <= 1e-6 * a.scale,
+            "{} and {}",
+            a.scale,
+            b.scale
+        );
     }
 }
 
@@ -133,13 +189,18 @@ fn spherical_harmonics_are_orthonormal() {
             let harmonics = spherical_harmonics([radius * angle.cos(), radius * angle.sin(), z]);
             let area = 4.0 * std::f64::consts::PI / (rings * steps) as f64;
             for (row, a) in products.iter_mut().zip(harmonics) {
-                row.iter_mut().zip(harmonics).for_each(|(sum, b)| *sum += area * a * b);
+                row.iter_mut()
+                    .zip(harmonics)
+                    .for_each(|(sum, b)| *sum += area * a * b);
             }
         }
     }
     for (i, row) in products.iter().enumerate() {
         for (j, product) in row.iter().enumerate() {
-            assert!((product - f64::from(u8::from(i == j))).abs() < 1e-5, "harmonics {i}, {j}: {product}");
+            assert!(
+                (product - f64::from(u8::from(i == j))).abs() < 1e-5,
+                "harmonics {i}, {j}: {product}"
+            );
         }
     }
 }
@@ -163,11 +224,22 @@ fn rays_meet_a_box_where_they_enter_and_leave_it() {
         } else {
             met += 1;
             for t in samples {
-                assert_eq!(inside(t), near < t && t < far, "near {near}, far {far}, t {t}");
+                assert_eq!(
+                    inside(t),
+                    near < t && t < far,
+                    "near {near}, far {far}, t {t}"
+                );
             }
         }
     }
     assert!(met > 20);
     let through = sampling::collide_box(half, [0.0; 3], [0.0, 1.0, 0.0]);
-    assert_eq!(through, Stretch { near: 0.0, far: 0.5, outside: false });
+    assert_eq!(
+        through,
+        Stretch {
+            near: 0.0,
+            far: 0.5,
+            outside: false
+        }
+    );
 }

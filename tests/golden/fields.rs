@@ -10,20 +10,31 @@ use crate::{assert_close, parameter};
 /// Puts the layers `{prefix}{0..}` of an archive on the tape, and gives them back with their arrays' names.
 fn layers(tape: &mut Tape, npz: &Npz, prefix: &str) -> (Vec<NormedLayer>, Vec<(String, Var)>) {
     let (mut layers, mut named) = (Vec::new(), Vec::new());
-    while npz.find(&format!("{prefix}{}_bias", layers.len())).is_some() {
+    while npz
+        .find(&format!("{prefix}{}_bias", layers.len()))
+        .is_some()
+    {
         let mut put = |part: &str| {
             let array = format!("{prefix}{}_{part}", layers.len());
             let var = parameter(tape, npz, &array);
             named.push((array, var));
             var
         };
-        layers.push(NormedLayer { v: put("weight_v"), g: put("weight_g"), bias: put("bias") });
+        layers.push(NormedLayer {
+            v: put("weight_v"),
+            g: put("weight_g"),
+            bias: put("bias"),
+        });
     }
     assert!(layers.len() >= 2);
     (layers, named)
 }
 
-fn check_network(archive: &str, prefix: &str, network: impl Fn(&mut Tape, &[NormedLayer], Var) -> Var) {
+fn check_network(
+    archive: &str,
+    prefix: &str,
+    network: impl Fn(&mut Tape, &[NormedLayer], Var) -> Var,
+) {
     let Some(npz) = golden::open(archive) else {
         return;
     };
@@ -35,13 +46,20 @@ fn check_network(archive: &str, prefix: &str, network: impl Fn(&mut Tape, &[Norm
     let gradients = tape.backward_with(y, npz.values("cotangent"));
     assert_close("grad_x", &gradients.get(x), npz.values("grad_x"), 1e-11);
     for (array, var) in named {
-        assert_close(&array, &gradients.get(var), npz.values(&format!("grad_{array}")), 1e-11);
+        assert_close(
+            &array,
+            &gradients.get(var),
+            npz.values(&format!("grad_{array}")),
+            1e-11,
+        );
     }
 }
 
 #[test]
 fn geometry_net() {
-    check_network("geometry_net", "glin", |tape, layers, x| networks::geometry_network(tape, layers[0], layers[1], x));
+    check_network("geometry_net", "glin", |tape, layers, x| {
+        networks::geometry_network(tape, layers[0], layers[1], x)
+    });
 }
 
 #[test]
@@ -54,7 +72,11 @@ fn direction_encoding() {
     let Some(npz) = golden::open("direction_encoding") else {
         return;
     };
-    let ours: Vec<f64> = npz.vectors("d").into_iter().flat_map(networks::direction_encoding).collect();
+    let ours: Vec<f64> = npz
+        .vectors("d")
+        .into_iter()
+        .flat_map(networks::direction_encoding)
+        .collect();
     assert_close("encoding", &ours, npz.values("encoding"), 1e-13);
 }
 
@@ -64,21 +86,50 @@ fn check_hash_grid(archive: &str, base: u32, max: u32, log2_size: u32) {
         return;
     };
     let levels = npz.values("scale").len();
-    let [points, width] = *npz.shape("encoding") else { panic!("encoding is points x features") };
+    let [points, width] = *npz.shape("encoding") else {
+        panic!("encoding is points x features")
+    };
     let grid = Grid::exact(levels, base, max, log2_size, width / levels);
     let ours = |f: &dyn Fn(&Level) -> f64| -> Vec<f64> { grid.levels.iter().map(f).collect() };
-    assert_close("scale", &ours(&|level| level.scale), npz.values("scale"), 1e-14);
-    assert_eq!(ours(&|level| f64::from(level.resolution)), npz.values("resolution"));
-    assert_eq!(ours(&|level| f64::from(level.entries)), npz.values("entries"));
-    assert_eq!(ours(&|level| f64::from(u8::from(level.dense))), npz.values("dense"));
-    assert_eq!(ours(&|level| level.offset as f64), npz.values("offset")[..levels]);
+    assert_close(
+        "scale",
+        &ours(&|level| level.scale),
+        npz.values("scale"),
+        1e-14,
+    );
+    assert_eq!(
+        ours(&|level| f64::from(level.resolution)),
+        npz.values("resolution")
+    );
+    assert_eq!(
+        ours(&|level| f64::from(level.entries)),
+        npz.values("entries")
+    );
+    assert_eq!(
+        ours(&|level| f64::from(u8::from(level.dense))),
+        npz.values("dense")
+    );
+    assert_eq!(
+        ours(&|level| level.offset as f64),
+        npz.values("offset")[..levels]
+    );
     assert_eq!(grid.entries() as f64, npz.values("offset")[levels]);
 
     let table = golden::table(grid.parameters(), 1.0);
-    let u: Vec<[f64; 3]> = npz.vectors("x").iter().map(|x| x.map(|x| (x + 1.0) / 2.0)).collect();
+    let u: Vec<[f64; 3]> = npz
+        .vectors("x")
+        .iter()
+        .map(|x| x.map(|x| (x + 1.0) / 2.0))
+        .collect();
     let rows = npz.shape("index")[0];
-    let cells: Vec<_> = u[..rows].iter().flat_map(|&u| grid.levels.iter().map(move |level| level.cell(u))).collect();
-    let index: Vec<f64> = cells.iter().flat_map(|cell| cell.index.map(f64::from)).collect();
+    let cells: Vec<_> = u[..rows]
+        .iter()
+        .flat_map(|&u| grid.levels.iter().map(move |level| level.cell(u)))
+        .collect();
+    let index: Vec<f64> = cells
+        .iter()
+        .flat_map(|cell| cell.index.map(f64::from))
+        .collect();
     assert_eq!(index, npz.values("index"));
     let weight: Vec<f64> = cells.iter().flat_map(|cell| cell.weight).collect();
     assert_close("weight", &weight, npz.values("weight"), 1e-7); // stored as f32
@@ -100,7 +151,11 @@ fn check_hash_grid(archive: &str, base: u32, max: u32, log2_size: u32) {
     assert_close("grad_u", &d_u, npz.values("grad_u"), 1e-10);
     assert_close("grad2_u", &d2_u, npz.values("grad2_u"), 1e-10);
     for (name, gradient) in [("gt", &d_table), ("gt2", &d2_table)] {
-        let some: Vec<f64> = npz.values(&format!("{name}_index")).iter().map(|&i| gradient[i as usize]).collect();
+        let some: Vec<f64> = npz
+            .values(&format!("{name}_index"))
+            .iter()
+            .map(|&i| gradient[i as usize])
+            .collect();
         assert_close(name, &some, npz.values(&format!("{name}_value")), 1e-10);
     }
     let sum: f64 = d_table.iter().map(|d| d.abs()).sum();

@@ -18,10 +18,15 @@ use reference::tape::{Tape, Var};
 #[track_caller]
 fn assert_close(what: &str, ours: &[f64], theirs: &[f64], relative: f64) {
     assert_eq!(ours.len(), theirs.len(), "{what}: lengths");
-    let largest = theirs.iter().fold(f64::MIN_POSITIVE, |largest, x| x.abs().max(largest));
+    let largest = theirs
+        .iter()
+        .fold(f64::MIN_POSITIVE, |largest, x| x.abs().max(largest));
     for (i, (a, b)) in ours.iter().zip(theirs).enumerate() {
         let error = (a - b).abs();
-        assert!(error <= relative * largest, "{what}[{i}] = {a}, golden {b}: off by {error:.2e}, largest {largest:.2e}");
+        assert!(
+            error <= relative * largest,
+            "{what}[{i}] = {a}, golden {b}: off by {error:.2e}, largest {largest:.2e}"
+        );
     }
 }
 

@@ -45,19 +45,32 @@ pub struct Field {
 /// `samples + 1` edges, uniform in disparity: 1/t = s/far + (1 − s)/near, each s with its own draw.
 pub fn edges(samples: usize, near: f64, far: f64, draws: Option<&[f64]>) -> Vec<f64> {
     let draw = |edge: usize| draws.map_or(0.5, |draws| draws[edge]);
-    let s = place(samples, draws.is_some().then_some(&draw as &dyn Fn(usize) -> f64));
-    s.into_iter().map(|s| 1.0 / (s / far + (1.0 - s) / near)).collect()
+    let s = place(
+        samples,
+        draws.is_some().then_some(&draw as &dyn Fn(usize) -> f64),
+    );
+    s.into_iter()
+        .map(|s| 1.0 / (s / far + (1.0 - s) / near))
+        .collect()
 }
 
 /// x inside the unit ball, (2 − 1/‖x‖) x/‖x‖ beyond: all of space in a ball of radius 2.
 pub fn contract(x: [f64; 3]) -> [f64; 3] {
     let length = dot(x, x).sqrt();
-    if length <= 1.0 { x } else { x.map(|x| (2.0 - 1.0 / length) * x / length) }
+    if length <= 1.0 {
+        x
+    } else {
+        x.map(|x| (2.0 - 1.0 / length) * x / length)
+    }
 }
 
 /// Where the field's grid is asked for x: contracted space fills the unit cube, (c(x) + 2)/4; uncontracted (x + 1)/2.
 pub fn grid_point(x: [f64; 3], contraction: bool) -> [f64; 3] {
-    if contraction { contract(x).map(|x| (x + 2.0) / 4.0) } else { x.map(|x| (x + 1.0) / 2.0) }
+    if contraction {
+        contract(x).map(|x| (x + 2.0) / 4.0)
+    } else {
+        x.map(|x| (x + 1.0) / 2.0)
+    }
 }
 
 impl Field {
@@ -91,10 +104,17 @@ impl Field {
         let density = tape.reshape(density, rays, samples);
         let weights = ray_weights(tape, density, bin_lengths);
 
-        let harmonics = directions.iter().flat_map(|&d| spherical_harmonics(d)).collect();
+        let harmonics = directions
+            .iter()
+            .flat_map(|&d| spherical_harmonics(d))
+            .collect();
         let harmonics = tape.constant(rays, 16, harmonics);
-        let ray_of_sample: Vec<usize> = (0..rays * samples).map(|sample| sample / samples).collect();
-        let mut input = vec![tape.gather_rows(harmonics, ray_of_sample.clone()), tape.columns(heads, 1..1 + config.geometry)];
+        let ray_of_sample: Vec<usize> =
+            (0..rays * samples).map(|sample| sample / samples).collect();
+        let mut input = vec![
+            tape.gather_rows(harmonics, ray_of_sample.clone()),
+            tape.columns(heads, 1..1 + config.geometry),
+        ];
         if let Some(code) = self.code {
             input.push(tape.gather_rows(code, ray_of_sample));
         }

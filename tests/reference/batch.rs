@@ -177,27 +177,51 @@ impl StepConfig {
         normed("surface.heads".into(), 2 + self.features, self.hidden);
         let mut inputs = 3 + 27 + 3 + self.features + self.appearance;
         for layer in 0..=self.color_layers {
-            let outputs = if layer < self.color_layers { self.color_hidden } else { 3 };
+            let outputs = if layer < self.color_layers {
+                self.color_hidden
+            } else {
+                3
+            };
             normed(format!("color.{layer}"), outputs, inputs);
             inputs = outputs;
         }
-        plain("surface.table".into(), self.grid.entries(), self.grid.features);
+        plain(
+            "surface.table".into(),
+            self.grid.entries(),
+            self.grid.features,
+        );
         if self.appearance > 0 {
             plain("appearance".into(), self.views, self.appearance);
         }
         for (level, grid) in self.proposal_grids.iter().enumerate() {
-            plain(format!("proposal.{level}.table"), grid.entries(), grid.features);
-            plain(format!("proposal.{level}.hidden"), self.proposal_hidden, grid.width());
+            plain(
+                format!("proposal.{level}.table"),
+                grid.entries(),
+                grid.features,
+            );
+            plain(
+                format!("proposal.{level}.hidden"),
+                self.proposal_hidden,
+                grid.width(),
+            );
             plain(format!("proposal.{level}.out"), 1, self.proposal_hidden);
         }
         match &self.background {
             Background::Black | Background::Fixed(_) => {}
             Background::Learned => plain("background.constant".into(), 1, 3),
             Background::Field(field) => {
-                plain("background.table".into(), field.grid.entries(), field.grid.features);
+                plain(
+                    "background.table".into(),
+                    field.grid.entries(),
+                    field.grid.features,
+                );
                 plain("background.hidden".into(), field.hidden, field.grid.width());
                 plain("background.heads".into(), 1 + field.geometry, field.hidden);
-                plain("background.color.0".into(), field.hidden, 16 + field.geometry + field.appearance);
+                plain(
+                    "background.color.0".into(),
+                    field.hidden,
+                    16 + field.geometry + field.appearance,
+                );
                 plain("background.color.1".into(), field.hidden, field.hidden);
                 plain("background.color.2".into(), 3, field.hidden);
                 if field.appearance > 0 {

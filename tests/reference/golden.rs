@@ -11,19 +11,25 @@ use std::path::PathBuf;
 
 /// An archive of the golden directory (`NEURODIN_GOLDEN`, else `../shared/golden` beside the crate), or None, with a word why.
 pub fn open(archive: &str) -> Option<Npz> {
-    let directory = std::env::var_os("NEURODIN_GOLDEN")
-        .map_or_else(|| PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../shared/golden")), PathBuf::from);
+    let directory = std::env::var_os("NEURODIN_GOLDEN").map_or_else(
+        || PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../shared/golden")),
+        PathBuf::from,
+    );
     let path = directory.join(format!("{archive}.npz"));
     if path.is_file() {
         return Some(Npz::open(&path));
     }
-    println!("skipped: {} is not there (NEURODIN_GOLDEN names the directory)", path.display());
+    println!(
+        "skipped: {} is not there (NEURODIN_GOLDEN names the directory)",
+        path.display()
+    );
     None
 }
 
 /// The tables' closed form: ((i · 2654435761) mod 2³²)/2³² − ½ at the flat index i, times `factor`.
 pub fn table(parameters: usize, factor: f64) -> Vec<f64> {
-    let value = |i: u64| (i.wrapping_mul(2_654_435_761) & 0xffff_ffff) as f64 / 4_294_967_296.0 - 0.5;
+    let value =
+        |i: u64| (i.wrapping_mul(2_654_435_761) & 0xffff_ffff) as f64 / 4_294_967_296.0 - 0.5;
     (0..parameters as u64).map(|i| factor * value(i)).collect()
 }
 
@@ -32,14 +38,24 @@ pub fn small_spans() -> Vec<(String, String)> {
     let mut pairs = Vec::new();
     let parts = [("v", "weight_v"), ("g", "weight_g"), ("bias", "bias")];
     for (ours, theirs) in parts {
-        pairs.push((format!("surface.hidden.{ours}"), format!("field_geometry_net_glin0_{theirs}")));
-        pairs.push((format!("surface.heads.{ours}"), format!("field_geometry_net_glin1_{theirs}")));
+        pairs.push((
+            format!("surface.hidden.{ours}"),
+            format!("field_geometry_net_glin0_{theirs}"),
+        ));
+        pairs.push((
+            format!("surface.heads.{ours}"),
+            format!("field_geometry_net_glin1_{theirs}"),
+        ));
         for layer in 0..3 {
-            pairs.push((format!("color.{layer}.{ours}"), format!("field_appearance_net_clin{layer}_{theirs}")));
+            pairs.push((
+                format!("color.{layer}.{ours}"),
+                format!("field_appearance_net_clin{layer}_{theirs}"),
+            ));
         }
     }
     for level in 0..2 {
-        let theirs = |layer: usize| format!("proposal_networks_{level}_mlp_base_net_net_{layer}_weight");
+        let theirs =
+            |layer: usize| format!("proposal_networks_{level}_mlp_base_net_net_{layer}_weight");
         pairs.push((format!("proposal.{level}.hidden"), theirs(0)));
         pairs.push((format!("proposal.{level}.out"), theirs(2)));
     }
@@ -68,7 +84,10 @@ pub fn whole_step(npz: &Npz) -> Step {
     let config = StepConfig {
         region: Region::Sphere,
         train: true,
-        proposal_grids: [Grid::exact(5, 16, 64, 17, 2), Grid::exact(5, 16, 256, 17, 2)],
+        proposal_grids: [
+            Grid::exact(5, 16, 64, 17, 2),
+            Grid::exact(5, 16, 256, 17, 2),
+        ],
         proposal_hidden: small("proposal_networks_0_mlp_base_net_net_0_weight").shape[0],
         proposal_samples: [bins(0), bins(1)],
         samples: bins(2),
@@ -91,11 +110,16 @@ pub fn whole_step(npz: &Npz) -> Step {
         bias_reduction: BiasReduction::Published,
         bias_needs_opaque: true,
     };
-    let mut params: BTreeMap<String, Vec<f64>> =
-        small_spans().into_iter().map(|(ours, theirs)| (ours, small(&theirs).values.clone())).collect();
+    let mut params: BTreeMap<String, Vec<f64>> = small_spans()
+        .into_iter()
+        .map(|(ours, theirs)| (ours, small(&theirs).values.clone()))
+        .collect();
     params.insert("surface.table".into(), table(config.grid.parameters(), 0.2));
     for (level, grid) in config.proposal_grids.iter().enumerate() {
-        params.insert(format!("proposal.{level}.table"), table(grid.parameters(), 2.0));
+        params.insert(
+            format!("proposal.{level}.table"),
+            table(grid.parameters(), 2.0),
+        );
     }
     let origins = npz.vectors("origins");
     let now = Now {
@@ -106,12 +130,27 @@ pub fn whole_step(npz: &Npz) -> Step {
     };
     let rays = Rays {
         directions: npz.vectors("directions"),
-        target: npz.vectors("target").iter().map(|&[r, g, b]| [r, g, b, 1.0]).collect(),
+        target: npz
+            .vectors("target")
+            .iter()
+            .map(|&[r, g, b]| [r, g, b, 1.0])
+            .collect(),
         view: vec![0; origins.len()],
         origins,
         stretches: None,
     };
     let jitter = ["draw0_rand", "draw1_rand", "draw2_rand"].map(|draw| npz.values(draw).to_vec());
-    let draws = Draws { jitter, taps: npz.values("draw3_rand").to_vec(), background: Vec::new() };
-    Step { config, params, rays, draws, now, edges: None }
+    let draws = Draws {
+        jitter,
+        taps: npz.values("draw3_rand").to_vec(),
+        background: Vec::new(),
+    };
+    Step {
+        config,
+        params,
+        rays,
+        draws,
+        now,
+        edges: None,
+    }
 }

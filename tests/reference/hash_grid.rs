@@ -40,14 +40,21 @@ impl Level {
     fn new(scale: f64, resolution: u32, log2_size: u32, offset: usize) -> Level {
         let vertices = u64::from(resolution).pow(3);
         let entries = vertices.div_ceil(8).saturating_mul(8).min(1 << log2_size) as u32;
-        Level { scale, resolution, entries, offset, dense: vertices <= u64::from(entries) }
+        Level {
+            scale,
+            resolution,
+            entries,
+            offset,
+            dense: vertices <= u64::from(entries),
+        }
     }
 
     pub fn index(&self, vertex: [u32; 3]) -> u32 {
         let [x, y, z] = vertex;
         let index = if self.dense {
             let r = self.resolution;
-            x.wrapping_add(y.wrapping_mul(r)).wrapping_add(z.wrapping_mul(r.wrapping_mul(r)))
+            x.wrapping_add(y.wrapping_mul(r))
+                .wrapping_add(z.wrapping_mul(r.wrapping_mul(r)))
         } else {
             x ^ y.wrapping_mul(2_654_435_761) ^ z.wrapping_mul(805_459_861)
         };
@@ -58,16 +65,35 @@ impl Level {
         let p = u.map(|u| self.scale * u + 0.5);
         let first = p.map(|p| p.floor() as i64 as u32);
         let w = p.map(|p| p - p.floor());
-        let mut cell = Cell { index: [0; 8], weight: [0.0; 8], slope: [[0.0; 3]; 8], bend: [[0.0; 3]; 8] };
+        let mut cell = Cell {
+            index: [0; 8],
+            weight: [0.0; 8],
+            slope: [[0.0; 3]; 8],
+            bend: [[0.0; 3]; 8],
+        };
         for corner in 0..8 {
             let bit = [corner & 1, corner >> 1 & 1, corner >> 2 & 1];
             let vertex = [0, 1, 2].map(|axis| first[axis].wrapping_add(bit[axis] as u32));
-            let side = [0, 1, 2].map(|axis| if bit[axis] == 1 { w[axis] } else { 1.0 - w[axis] });
+            let side = [0, 1, 2].map(|axis| {
+                if bit[axis] == 1 {
+                    w[axis]
+                } else {
+                    1.0 - w[axis]
+                }
+            });
             let sign = bit.map(|bit| if bit == 1 { self.scale } else { -self.scale });
             cell.index[corner] = self.index(vertex);
             cell.weight[corner] = side[0] * side[1] * side[2];
-            cell.slope[corner] = [sign[0] * side[1] * side[2], side[0] * sign[1] * side[2], side[0] * side[1] * sign[2]];
-            cell.bend[corner] = [sign[0] * sign[1] * side[2], sign[0] * side[1] * sign[2], side[0] * sign[1] * sign[2]];
+            cell.slope[corner] = [
+                sign[0] * side[1] * side[2],
+                side[0] * sign[1] * side[2],
+                side[0] * side[1] * sign[2],
+            ];
+            cell.bend[corner] = [
+                sign[0] * sign[1] * side[2],
+                sign[0] * side[1] * sign[2],
+                side[0] * sign[1] * sign[2],
+            ];
         }
         cell
     }
@@ -93,7 +119,12 @@ impl Grid {
         })
     }
 
-    fn with_scales(levels: usize, log2_size: u32, features: usize, scale_at: impl Fn(usize) -> (f64, u32)) -> Grid {
+    fn with_scales(
+        levels: usize,
+        log2_size: u32,
+        features: usize,
+        scale_at: impl Fn(usize) -> (f64, u32),
+    ) -> Grid {
         let mut offset = 0;
         let levels = (0..levels)
             .map(|level| {
@@ -108,7 +139,9 @@ impl Grid {
 
     /// Entries of all levels.
     pub fn entries(&self) -> usize {
-        self.levels.last().map_or(0, |level| level.offset + level.entries as usize)
+        self.levels
+            .last()
+            .map_or(0, |level| level.offset + level.entries as usize)
     }
 
     /// Parameters: `entries() * features`.
@@ -126,7 +159,12 @@ impl Grid {
         for (l, level) in self.levels.iter().enumerate() {
             let cell = level.cell(u);
             for corner in 0..8 {
-                visit(l, corner, (level.offset + cell.index[corner] as usize) * self.features, &cell);
+                visit(
+                    l,
+                    corner,
+                    (level.offset + cell.index[corner] as usize) * self.features,
+                    &cell,
+                );
             }
         }
     }
@@ -136,7 +174,8 @@ impl Grid {
         let mut encoding = vec![0.0; self.width()];
         self.visit(u, |level, corner, first, cell| {
             for feature in 0..self.features {
-                encoding[level * self.features + feature] += cell.weight[corner] * table[first + feature];
+                encoding[level * self.features + feature] +=
+                    cell.weight[corner] * table[first + feature];
             }
         });
         encoding
@@ -148,7 +187,9 @@ impl Grid {
         self.visit(u, |level, corner, first, cell| {
             for feature in 0..self.features {
                 let row = &mut jacobian[level * self.features + feature];
-                *row = std::array::from_fn(|axis| row[axis] + cell.slope[corner][axis] * table[first + feature]);
+                *row = std::array::from_fn(|axis| {
+                    row[axis] + cell.slope[corner][axis] * table[first + feature]
+                });
             }
         });
         jacobian
@@ -158,7 +199,8 @@ impl Grid {
     pub fn add_table_gradient(&self, u: [f64; 3], d_encoding: &[f64], d_table: &mut [f64]) {
         self.visit(u, |level, corner, first, cell| {
             for feature in 0..self.features {
-                d_table[first + feature] += cell.weight[corner] * d_encoding[level * self.features + feature];
+                d_table[first + feature] +=
+                    cell.weight[corner] * d_encoding[level * self.features + feature];
             }
         });
     }
@@ -173,7 +215,13 @@ impl Grid {
     }
 
     /// Adds ∂(h · ∂(d_e · e)/∂u)/∂table, the table's share of a loss on the spatial derivative.
-    pub fn add_table_gradient_of_slope(&self, u: [f64; 3], d_encoding: &[f64], h: [f64; 3], d_table: &mut [f64]) {
+    pub fn add_table_gradient_of_slope(
+        &self,
+        u: [f64; 3],
+        d_encoding: &[f64],
+        h: [f64; 3],
+        d_table: &mut [f64],
+    ) {
         self.visit(u, |level, corner, first, cell| {
             let slope: f64 = (0..3).map(|axis| h[axis] * cell.slope[corner][axis]).sum();
             for feature in 0..self.features {
@@ -183,7 +231,13 @@ impl Grid {
     }
 
     /// ∂(h · ∂(d_e · e)/∂u)/∂u
-    pub fn point_gradient_of_slope(&self, table: &[f64], u: [f64; 3], d_encoding: &[f64], h: [f64; 3]) -> [f64; 3] {
+    pub fn point_gradient_of_slope(
+        &self,
+        table: &[f64],
+        u: [f64; 3],
+        d_encoding: &[f64],
+        h: [f64; 3],
+    ) -> [f64; 3] {
         let mut d_u = [0.0; 3];
         self.visit(u, |level, corner, first, cell| {
             let [xy, xz, yz] = cell.bend[corner];
@@ -209,20 +263,30 @@ pub fn growth(levels: usize, base: u32, max: u32) -> f64 {
 /// e(u) for u `[n, 3]` and a table `[entries, features]`: `[n, width]`.
 pub fn encode(tape: &mut Tape, grid: &Grid, table: Var, u: Var) -> Var {
     assert_eq!((table.len(), u.cols), (grid.parameters(), 3));
-    let point = move |tape: &Tape, row: usize| -> [f64; 3] { std::array::from_fn(|axis| tape.value(u)[row * 3 + axis]) };
+    let point = move |tape: &Tape, row: usize| -> [f64; 3] {
+        std::array::from_fn(|axis| tape.value(u)[row * 3 + axis])
+    };
     let width = grid.width();
-    let value = (0..u.rows).flat_map(|row| grid.encode(tape.value(table), point(tape, row))).collect();
+    let value = (0..u.rows)
+        .flat_map(|row| grid.encode(tape.value(table), point(tape, row)))
+        .collect();
     let grid = grid.clone();
-    tape.record(u.rows, width, value, &[table, u], move |tape, d_encoding, gradients| {
-        for (row, d_encoding) in d_encoding.chunks_exact(width).enumerate() {
-            let at = point(tape, row);
-            if let Some(d_table) = gradients.of(table) {
-                grid.add_table_gradient(at, d_encoding, d_table);
+    tape.record(
+        u.rows,
+        width,
+        value,
+        &[table, u],
+        move |tape, d_encoding, gradients| {
+            for (row, d_encoding) in d_encoding.chunks_exact(width).enumerate() {
+                let at = point(tape, row);
+                if let Some(d_table) = gradients.of(table) {
+                    grid.add_table_gradient(at, d_encoding, d_table);
+                }
+                if let Some(d_u) = gradients.of(u) {
+                    let d_at = grid.point_gradient(tape.value(table), at, d_encoding);
+                    (0..3).for_each(|axis| d_u[row * 3 + axis] += d_at[axis]);
+                }
             }
-            if let Some(d_u) = gradients.of(u) {
-                let d_at = grid.point_gradient(tape.value(table), at, d_encoding);
-                (0..3).for_each(|axis| d_u[row * 3 + axis] += d_at[axis]);
-            }
-        }
-    })
+        },
+    )
 }

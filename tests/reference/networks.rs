@@ -18,13 +18,22 @@ pub fn weight_norm(tape: &mut Tape, v: Var, g: Var) -> Var {
             let direction = &tape.value(v)[row * cols..(row + 1) * cols];
             let length = norm(direction);
             // ∂L/∂g = d_w · V/‖V‖ and ∂L/∂V = g/‖V‖ (d_w − (∂L/∂g) V/‖V‖).
-            let d_scale = d_w.iter().zip(direction).map(|(d_w, v)| d_w * v).sum::<f64>() / length;
+            let d_scale = d_w
+                .iter()
+                .zip(direction)
+                .map(|(d_w, v)| d_w * v)
+                .sum::<f64>()
+                / length;
             let factor = tape.value(g)[row] / length;
             if let Some(d_g) = gradients.of(g) {
                 d_g[row] += d_scale;
             }
             if let Some(d_v) = gradients.of(v) {
-                for ((d_v, d_w), v) in d_v[row * cols..(row + 1) * cols].iter_mut().zip(d_w).zip(direction) {
+                for ((d_v, d_w), v) in d_v[row * cols..(row + 1) * cols]
+                    .iter_mut()
+                    .zip(d_w)
+                    .zip(direction)
+                {
                     *d_v += factor * (d_w - d_scale * v / length);
                 }
             }
@@ -56,10 +65,18 @@ pub fn softplus_100(tape: &mut Tape, x: Var) -> Var {
     tape.map(
         x,
         |x| {
-            if 100.0 * x > 20.0 { x } else { (100.0 * x).exp().ln_1p() / 100.0 }
+            if 100.0 * x > 20.0 {
+                x
+            } else {
+                (100.0 * x).exp().ln_1p() / 100.0
+            }
         },
         |x, _| {
-            if 100.0 * x > 20.0 { 1.0 } else { logistic(100.0 * x) }
+            if 100.0 * x > 20.0 {
+                1.0
+            } else {
+                logistic(100.0 * x)
+            }
         },
     )
 }
@@ -79,12 +96,18 @@ pub fn exp_with_bounded_slope(tape: &mut Tape, x: Var) -> Var {
 }
 
 pub fn logistic(x: f64) -> f64 {
-    if x >= 0.0 { 1.0 / (1.0 + (-x).exp()) } else { x.exp() / (1.0 + x.exp()) }
+    if x >= 0.0 {
+        1.0 / (1.0 + (-x).exp())
+    } else {
+        x.exp() / (1.0 + x.exp())
+    }
 }
 
 /// Weight-normalised ReLU layers, the last one with a sigmoid instead.
 pub fn color_network(tape: &mut Tape, layers: &[NormedLayer], x: Var) -> Var {
-    let (last, hidden) = layers.split_last().expect("a network of at least one layer");
+    let (last, hidden) = layers
+        .split_last()
+        .expect("a network of at least one layer");
     let mut x = x;
     for layer in hidden {
         let z = layer.apply(tape, x);
@@ -103,7 +126,9 @@ pub fn geometry_network(tape: &mut Tape, hidden: NormedLayer, heads: NormedLayer
 
 /// Plain layers without bias, ReLU between them.
 pub fn plain_network(tape: &mut Tape, layers: &[Var], x: Var) -> Var {
-    let (last, hidden) = layers.split_last().expect("a network of at least one layer");
+    let (last, hidden) = layers
+        .split_last()
+        .expect("a network of at least one layer");
     let mut x = x;
     for &layer in hidden {
         let z = tape.matmul_transposed(x, layer);

@@ -21,11 +21,14 @@ impl Npz {
     pub fn open(path: &Path) -> Npz {
         let name = path.display().to_string();
         let file = File::open(path).unwrap_or_else(|error| panic!("{name}: {error}"));
-        let mut archive = NpzArchive::new(BufReader::new(file)).unwrap_or_else(|error| panic!("{name}: {error}"));
+        let mut archive =
+            NpzArchive::new(BufReader::new(file)).unwrap_or_else(|error| panic!("{name}: {error}"));
         let names: Vec<String> = archive.array_names().map(str::to_string).collect();
         let mut arrays = BTreeMap::new();
         for array in names {
-            let file = archive.by_name(&array).unwrap_or_else(|error| panic!("{name}: {array}: {error}"));
+            let file = archive
+                .by_name(&array)
+                .unwrap_or_else(|error| panic!("{name}: {array}: {error}"));
             let file = file.unwrap_or_else(|| panic!("{name}: {array} has vanished"));
             if let Some(values) = read(file) {
                 arrays.insert(array, values);
@@ -43,7 +46,8 @@ impl Npz {
     }
 
     pub fn array(&self, array: &str) -> &Array {
-        self.find(array).unwrap_or_else(|| panic!("{}: no array {array}", self.name))
+        self.find(array)
+            .unwrap_or_else(|| panic!("{}: no array {array}", self.name))
     }
 
     pub fn values(&self, array: &str) -> &[f64] {
@@ -62,8 +66,16 @@ impl Npz {
 
     /// An array `[n, 3]` as points.
     pub fn vectors(&self, array: &str) -> Vec<[f64; 3]> {
-        assert_eq!(self.shape(array).last(), Some(&3), "{}: {array} holds vectors", self.name);
-        self.values(array).chunks_exact(3).map(|v| [v[0], v[1], v[2]]).collect()
+        assert_eq!(
+            self.shape(array).last(),
+            Some(&3),
+            "{}: {array} holds vectors",
+            self.name
+        );
+        self.values(array)
+            .chunks_exact(3)
+            .map(|v| [v[0], v[1], v[2]])
+            .collect()
     }
 }
 
@@ -77,16 +89,55 @@ fn read<R: Read>(file: npyz::NpyFile<R>) -> Option<Array> {
     };
     let stored: Vec<f64> = match (type_char(&kind), kind.num_bytes()?) {
         (Float, 8) => file.into_vec::<f64>().ok()?,
-        (Float, 4) => file.into_vec::<f32>().ok()?.into_iter().map(f64::from).collect(),
-        (Int, 8) => file.into_vec::<i64>().ok()?.into_iter().map(|x| x as f64).collect(),
-        (Int, 4) => file.into_vec::<i32>().ok()?.into_iter().map(f64::from).collect(),
-        (Uint, 8) => file.into_vec::<u64>().ok()?.into_iter().map(|x| x as f64).collect(),
-        (Uint, 4) => file.into_vec::<u32>().ok()?.into_iter().map(f64::from).collect(),
-        (Uint, 1) => file.into_vec::<u8>().ok()?.into_iter().map(f64::from).collect(),
-        (Bool, 1) => file.into_vec::<bool>().ok()?.into_iter().map(|x| f64::from(u8::from(x))).collect(),
+        (Float, 4) => file
+            .into_vec::<f32>()
+            .ok()?
+            .into_iter()
+            .map(f64::from)
+            .collect(),
+        (Int, 8) => file
+            .into_vec::<i64>()
+            .ok()?
+            .into_iter()
+            .map(|x| x as f64)
+            .collect(),
+        (Int, 4) => file
+            .into_vec::<i32>()
+            .ok()?
+            .into_iter()
+            .map(f64::from)
+            .collect(),
+        (Uint, 8) => file
+            .into_vec::<u64>()
+            .ok()?
+            .into_iter()
+            .map(|x| x as f64)
+            .collect(),
+        (Uint, 4) => file
+            .into_vec::<u32>()
+            .ok()?
+            .into_iter()
+            .map(f64::from)
+            .collect(),
+        (Uint, 1) => file
+            .into_vec::<u8>()
+            .ok()?
+            .into_iter()
+            .map(f64::from)
+            .collect(),
+        (Bool, 1) => file
+            .into_vec::<bool>()
+            .ok()?
+            .into_iter()
+            .map(|x| f64::from(u8::from(x)))
+            .collect(),
         _ => return None,
     };
-    let values = if order == Order::C || shape.len() < 2 { stored } else { row_major(&shape, &stored) };
+    let values = if order == Order::C || shape.len() < 2 {
+        stored
+    } else {
+        row_major(&shape, &stored)
+    };
     Some(Array { shape, values })
 }
 
@@ -99,7 +150,11 @@ fn row_major(shape: &[usize], stored: &[f64]) -> Vec<f64> {
     (0..stored.len())
         .map(|mut i| {
             let index: Vec<usize> = shape.iter().rev().map(|n| (i % n, i /= n).0).collect();
-            let at = shape.iter().zip(index.iter().rev()).rev().fold(0, |at, (n, index)| at * n + index);
+            let at = shape
+                .iter()
+                .zip(index.iter().rev())
+                .rev()
+                .fold(0, |at, (n, index)| at * n + index);
             stored[at]
         })
         .collect()

@@ -15,7 +15,15 @@ pub struct Adam {
 impl Adam {
     pub fn new(len: usize, betas: [f64; 2], epsilon: f64, weight_decay: f64) -> Adam {
         let [beta1, beta2] = betas;
-        Adam { beta1, beta2, epsilon, weight_decay, steps: 0, m: vec![0.0; len], v: vec![0.0; len] }
+        Adam {
+            beta1,
+            beta2,
+            epsilon,
+            weight_decay,
+            steps: 0,
+            m: vec![0.0; len],
+            v: vec![0.0; len],
+        }
     }
 
     /// p ← p(1 − ηλ); m ← β₁m + (1 − β₁)g; v ← β₂v + (1 − β₂)g²; p ← p − η m̂/(√v̂ + ε) with the bias-corrected moments. Entries of
@@ -28,7 +36,8 @@ impl Adam {
             *p *= 1.0 - learning_rate * self.weight_decay;
             self.m[i] = self.beta1 * self.m[i] + (1.0 - self.beta1) * g;
             self.v[i] = self.beta2 * self.v[i] + (1.0 - self.beta2) * g * g;
-            *p -= learning_rate * (self.m[i] / correction1) / ((self.v[i] / correction2).sqrt() + self.epsilon);
+            *p -= learning_rate * (self.m[i] / correction1)
+                / ((self.v[i] / correction2).sqrt() + self.epsilon);
         }
     }
 }

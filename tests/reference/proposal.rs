@@ -34,6 +34,9 @@ pub fn weights(tape: &mut Tape, raw: Var, lengths: Vec<f64>, bins: usize) -> Var
 
 /// (x + 1)/2: the cube [−1, 1]³ as the hash grids see it.
 pub fn unit_cube(tape: &mut Tape, points: &[[f64; 3]]) -> Var {
-    let u = points.iter().flat_map(|x| x.map(|x| (x + 1.0) / 2.0)).collect();
+    let u = points
+        .iter()
+        .flat_map(|x| x.map(|x| (x + 1.0) / 2.0))
+        .collect();
     tape.constant(points.len(), 3, u)
 }

@@ -22,7 +22,11 @@ pub struct Stretch {
 }
 
 /// Stretch of a ray that misses: finite, so that everything stays a number.
-const MISSED: Stretch = Stretch { near: 1.0, far: 1.2, outside: true };
+const MISSED: Stretch = Stretch {
+    near: 1.0,
+    far: 1.2,
+    outside: true,
+};
 
 pub fn collide(region: Region, origin: [f64; 3], direction: [f64; 3]) -> Stretch {
     match region {
@@ -46,8 +50,15 @@ pub fn collide_sphere(origin: [f64; 3], direction: [f64; 3]) -> Stretch {
 pub fn collide_box(half: [f64; 3], origin: [f64; 3], direction: [f64; 3]) -> Stretch {
     let (mut near, mut far) = (0.0_f64, f64::INFINITY);
     for axis in 0..3 {
-        let d = if direction[axis].abs() < 1e-9 { 1e-9 } else { direction[axis] };
-        let (a, b) = ((-half[axis] - origin[axis]) / d, (half[axis] - origin[axis]) / d);
+        let d = if direction[axis].abs() < 1e-9 {
+            1e-9
+        } else {
+            direction[axis]
+        };
+        let (a, b) = (
+            (-half[axis] - origin[axis]) / d,
+            (half[axis] - origin[axis]) / d,
+        );
         near = near.max(a.min(b));
         far = far.min(a.max(b));
     }
@@ -58,15 +69,31 @@ pub fn collide_box(half: [f64; 3], origin: [f64; 3], direction: [f64; 3]) -> Str
 const SHORTEST: f64 = 1e-6;
 
 fn stretch(near: f64, far: f64) -> Stretch {
-    if far - near > SHORTEST { Stretch { near, far, outside: false } } else { MISSED }
+    if far - near > SHORTEST {
+        Stretch {
+            near,
+            far,
+            outside: false,
+        }
+    } else {
+        MISSED
+    }
 }
 
 pub fn warp(t: f64) -> f64 {
-    if t < 1.0 { t / 2.0 } else { 1.0 - 1.0 / (2.0 * t) }
+    if t < 1.0 {
+        t / 2.0
+    } else {
+        1.0 - 1.0 / (2.0 * t)
+    }
 }
 
 pub fn unwarp(s: f64) -> f64 {
-    if s < 0.5 { 2.0 * s } else { 1.0 / (2.0 - 2.0 * s) }
+    if s < 0.5 {
+        2.0 * s
+    } else {
+        1.0 / (2.0 - 2.0 * s)
+    }
 }
 
 /// Distance along the ray of the normalised position s.
@@ -84,15 +111,29 @@ pub fn place(bins: usize, draw: Option<&dyn Fn(usize) -> f64>) -> Vec<f64> {
     let Some(draw) = draw else { return s };
     (0..=bins)
         .map(|j| {
-            let lower = if j == 0 { s[0] } else { (s[j - 1] + s[j]) / 2.0 };
-            let upper = if j == bins { s[bins] } else { (s[j] + s[j + 1]) / 2.0 };
+            let lower = if j == 0 {
+                s[0]
+            } else {
+                (s[j - 1] + s[j]) / 2.0
+            };
+            let upper = if j == bins {
+                s[bins]
+            } else {
+                (s[j] + s[j + 1]) / 2.0
+            };
             lower + (upper - lower) * draw(j)
         })
         .collect()
 }
 
 /// `bins + 1` new edges, distributed like the histogram of `weights` to the power `anneal` between `edges`; `draw` shifts all of them.
-pub fn resample(edges: &[f64], weights: &[f64], anneal: f64, bins: usize, draw: Option<f64>) -> Vec<f64> {
+pub fn resample(
+    edges: &[f64],
+    weights: &[f64],
+    anneal: f64,
+    bins: usize,
+    draw: Option<f64>,
+) -> Vec<f64> {
     let mut histogram: Vec<f64> = weights.iter().map(|w| w.powf(anneal) + 0.01).collect();
     let padding = (1e-5 - histogram.iter().sum::<f64>()).max(0.0) / histogram.len() as f64;
     histogram.iter_mut().for_each(|w| *w += padding);
@@ -108,16 +149,26 @@ pub fn resample(edges: &[f64], weights: &[f64], anneal: f64, bins: usize, draw: 
         .map(|j| {
             let u = (j as f64 + draw.unwrap_or(0.5)) / count;
             let above = cdf.partition_point(|&c| c <= u);
-            let (below, above) = (above.saturating_sub(1).min(cdf.len() - 1), above.min(cdf.len() - 1));
+            let (below, above) = (
+                above.saturating_sub(1).min(cdf.len() - 1),
+                above.min(cdf.len() - 1),
+            );
             let step = cdf[above] - cdf[below];
-            let part = if step == 0.0 { 0.0 } else { ((u - cdf[below]) / step).clamp(0.0, 1.0) };
+            let part = if step == 0.0 {
+                0.0
+            } else {
+                ((u - cdf[below]) / step).clamp(0.0, 1.0)
+            };
             edges[below] + part * (edges[above] - edges[below])
         })
         .collect()
 }
 
 pub fn midpoints(distances: &[f64]) -> Vec<f64> {
-    distances.windows(2).map(|edge| (edge[0] + edge[1]) / 2.0).collect()
+    distances
+        .windows(2)
+        .map(|edge| (edge[0] + edge[1]) / 2.0)
+        .collect()
 }
 
 pub fn lengths(distances: &[f64]) -> Vec<f64> {

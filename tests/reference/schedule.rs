@@ -30,7 +30,16 @@ pub fn multi_step(k: u64, warmup: u64, milestones: &[u64], gamma: f64, inclusive
     if k < warmup {
         return k as f64 / warmup as f64;
     }
-    let past = milestones.iter().filter(|&&milestone| if inclusive { k >= milestone } else { k > milestone }).count();
+    let past = milestones
+        .iter()
+        .filter(|&&milestone| {
+            if inclusive {
+                k >= milestone
+            } else {
+                k > milestone
+            }
+        })
+        .count();
     gamma.powi(past as i32)
 }
 

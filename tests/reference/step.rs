@@ -16,23 +16,40 @@ struct Spans(BTreeMap<String, Var>);
 
 impl Spans {
     fn get(&self, name: &str) -> Var {
-        *self.0.get(name).unwrap_or_else(|| panic!("no parameter span {name}"))
+        *self
+            .0
+            .get(name)
+            .unwrap_or_else(|| panic!("no parameter span {name}"))
     }
 
     fn normed(&self, name: &str) -> NormedLayer {
         let part = |part: &str| self.get(&format!("{name}.{part}"));
-        NormedLayer { v: part("v"), g: part("g"), bias: part("bias") }
+        NormedLayer {
+            v: part("v"),
+            g: part("g"),
+            bias: part("bias"),
+        }
     }
 
     fn proposal(&self, level: usize) -> Proposal {
         let part = |part: &str| self.get(&format!("proposal.{level}.{part}"));
-        Proposal { table: part("table"), hidden: part("hidden"), out: part("out") }
+        Proposal {
+            table: part("table"),
+            hidden: part("hidden"),
+            out: part("out"),
+        }
     }
 }
 
 impl Step {
     pub fn run(&self) -> Outcome {
-        let Step { config, rays, draws, now, .. } = self;
+        let Step {
+            config,
+            rays,
+            draws,
+            now,
+            ..
+        } = self;
         let (n, samples) = (rays.origins.len(), config.samples);
         let tape = &mut Tape::default();
         let spans = self.put_parameters(tape);
@@ -40,10 +57,19 @@ impl Step {
         // Rays and samples.
         let stretches = rays.stretches.clone().unwrap_or_else(|| {
             let along = rays.origins.iter().zip(&rays.directions);
-            along.map(|(&origin, &direction)| sampling::collide(config.region, origin, direction)).collect()
+            along
+                .map(|(&origin, &direction)| sampling::collide(config.region, origin, direction))
+                .collect()
         });
-        let mut images = Images { stretches, ..Images::default() };
-        let bins = [config.proposal_samples[0], config.proposal_samples[1], samples];
+        let mut images = Images {
+            stretches,
+            ..Images::default()
+        };
+        let bins = [
+            config.proposal_samples[0],
+            config.proposal_samples[1],
+            samples,
+        ];
         let mut proposal_raw = Vec::new();
         let mut proposal_weights = Vec::new();
         for level in 0..3 {
@@ -53,7 +79,10 @@ impl Step {
                     edges[level][ray * (bins[level] + 1)..][..bins[level] + 1].to_vec()
                 } else if level == 0 {
                     let same = |_| draw.unwrap_or(0.5);
-                    sampling::place(bins[0], draw.is_some().then_some(&same as &dyn Fn(usize) -> f64))
+                    sampling::place(
+                        bins[0],
+                        draw.is_some().then_some(&same as &dyn Fn(usize) -> f64),
+                    )
                 } else {
                     let before = bins[level - 1];
                     let edges = &images.edges[level - 1][ray * (before + 1)..][..before + 1];
@@ -64,8 +93,14 @@ impl Step {
                 images.edges[level].extend(edges);
             }
             if level < 2 {
-                let points = self.points_at(bins[level], &per_ray(&images.distances[level], n, sampling::midpoints));
-                let raw = spans.proposal(level).log_density(tape, &config.proposal_grids[level], &points);
+                let points = self.points_at(
+                    bins[level],
+                    &per_ray(&images.distances[level], n, sampling::midpoints),
+                );
+                let raw =
+                    spans
+                        .proposal(level)
+                        .log_density(tape, &config.proposal_grids[level], &points);
                 let lengths = per_ray(&images.distances[level], n, sampling::lengths);
                 let weights = proposal::weights(tape, raw, lengths, bins[level]);
                 images.proposal_raw[level] = tape.value(raw).to_vec();
@@ -76,9 +111,15 @@ impl Step {
         }
 
         // The surface field at bin starts and around them.
-        let starts = self.points_at(samples, &per_ray(&images.distances[2], n, |t| t[..t.len() - 1].to_vec()));
-        let steps: Vec<f64> =
-            draws.taps.iter().map(|&draw| surface::tap_step(draw, config.tap_range, config.tap_floor)).collect();
+        let starts = self.points_at(
+            samples,
+            &per_ray(&images.distances[2], n, |t| t[..t.len() - 1].to_vec()),
+        );
+        let steps: Vec<f64> = draws
+            .taps
+            .iter()
+            .map(|&draw| surface::tap_step(draw, config.tap_range, config.tap_floor))
+            .collect();
         assert_eq!(steps.len(), n * samples, "one tap draw per shading sample");
         images.points = [starts.clone(), surface::tap_points(&starts, &steps)].concat();
         let field = Surface {
@@ -95,7 +136,13 @@ impl Step {
         let gradient = surface::six_tap_gradient(tape, taps, steps);
 
         // Density, weights, colours, image.
-        let inv_s = volume::inverse_scale(tape, logit, config.scale_range, config.scale_floor, now.inv_s_lower);
+        let inv_s = volume::inverse_scale(
+            tape,
+            logit,
+            config.scale_range,
+            config.scale_floor,
+            now.inv_s_lower,
+        );
         let beta = volume::reciprocal(tape, inv_s);
         let sdf = tape.rows(sdf_all, 0..n * samples);
         let sdf = self.empty_outside(tape, sdf, &images.stretches);
@@ -116,37 +163,85 @@ impl Step {
         let eikonal = tape.scale(eikonal, config.eikonal_weight);
 
         let weights_and_rest = tape.value(weights).to_vec();
-        images.weights = weights_and_rest.chunks_exact(samples + 1).flat_map(|row| row[..samples].to_vec()).collect();
+        images.weights = weights_and_rest
+            .chunks_exact(samples + 1)
+            .flat_map(|row| row[..samples].to_vec())
+            .collect();
         let midpoints = per_ray(&images.distances[2], n, sampling::midpoints);
         let mut middles = Vec::new();
         for ray in 0..n {
             let range = ray * samples..(ray + 1) * samples;
-            let (weights, sdf) = (&images.weights[range.clone()], &tape.value(sdf)[range.clone()]);
+            let (weights, sdf) = (
+                &images.weights[range.clone()],
+                &tape.value(sdf)[range.clone()],
+            );
             let meets = !images.stretches[ray].outside;
-            images.bias_gate.push(if meets { losses::bias_gate(sdf, weights, config.bias_needs_opaque) } else { 0.0 });
+            images.bias_gate.push(if meets {
+                losses::bias_gate(sdf, weights, config.bias_needs_opaque)
+            } else {
+                0.0
+            });
             let middle = midpoints[range.start + losses::heaviest(weights)];
-            middles.push(sampling::point_on_ray(rays.origins[ray], rays.directions[ray], middle));
+            middles.push(sampling::point_on_ray(
+                rays.origins[ray],
+                rays.directions[ray],
+                middle,
+            ));
             images.accumulation.push(weights.iter().sum());
-            images.transmittance.push(weights_and_rest[ray * (samples + 1) + samples]);
-            images.depth.push(volume::expected_depth(weights, &midpoints[range.clone()]));
-            images.normal.extend(mean_normal(weights, &tape.value(gradient)[range.start * 3..range.end * 3]));
+            images
+                .transmittance
+                .push(weights_and_rest[ray * (samples + 1) + samples]);
+            images
+                .depth
+                .push(volume::expected_depth(weights, &midpoints[range.clone()]));
+            images.normal.extend(mean_normal(
+                weights,
+                &tape.value(gradient)[range.start * 3..range.end * 3],
+            ));
         }
-        images.bias_points = losses::bias_points(&middles, &rays.directions, config.bias_epsilon, config.bias_offset);
+        images.bias_points = losses::bias_points(
+            &middles,
+            &rays.directions,
+            config.bias_epsilon,
+            config.bias_offset,
+        );
         let bias_sdf = field.sdf(tape, &config.grid, &images.bias_points);
         let gates = images.bias_gate.clone();
-        let bias = losses::bias(tape, bias_sdf, gates, config.bias_epsilon, config.bias_reduction);
+        let bias = losses::bias(
+            tape,
+            bias_sdf,
+            gates,
+            config.bias_epsilon,
+            config.bias_reduction,
+        );
         let bias = tape.scale(bias, now.bias_weight);
 
         let mut interlevel = tape.constant(1, 1, vec![0.0]);
         for (level, &weights) in proposal_weights.iter().enumerate() {
-            let loss = losses::interlevel(tape, weights, &images.edges[level], &images.weights, &images.edges[2]);
+            let loss = losses::interlevel(
+                tape,
+                weights,
+                &images.edges[level],
+                &images.weights,
+                &images.edges[2],
+            );
             interlevel = tape.add(interlevel, loss);
         }
         let interlevel = tape.scale(interlevel, config.interlevel_weight);
 
-        let named = [("color", color), ("eikonal", eikonal), ("bias", bias), ("interlevel", interlevel)];
-        let total = named[1..].iter().fold(color, |sum, &(_, loss)| tape.add(sum, loss));
-        let mut losses: BTreeMap<String, f64> = named.iter().map(|&(name, loss)| (name.to_string(), tape.scalar(loss))).collect();
+        let named = [
+            ("color", color),
+            ("eikonal", eikonal),
+            ("bias", bias),
+            ("interlevel", interlevel),
+        ];
+        let total = named[1..]
+            .iter()
+            .fold(color, |sum, &(_, loss)| tape.add(sum, loss));
+        let mut losses: BTreeMap<String, f64> = named
+            .iter()
+            .map(|&(name, loss)| (name.to_string(), tape.scalar(loss)))
+            .collect();
         losses.insert("total".into(), tape.scalar(total));
 
         // Back again.
@@ -163,7 +258,10 @@ impl Step {
         images.color_error = tape.value(color_error).to_vec();
         images.bias_sdf = tape.value(bias_sdf).to_vec();
         let d_images = ActivationGradients {
-            proposal_raw: [gradients.get(proposal_raw[0]), gradients.get(proposal_raw[1])],
+            proposal_raw: [
+                gradients.get(proposal_raw[0]),
+                gradients.get(proposal_raw[1]),
+            ],
             sdf: gradients.get(sdf_all),
             logit: gradients.get(logit),
             gradient: gradients.get(gradient),
@@ -172,12 +270,20 @@ impl Step {
             background: gradients.get(background),
             bias_sdf: gradients.get(bias_sdf),
         };
-        Outcome { losses, images, d_images, gradients: spans.gradients(&gradients) }
+        Outcome {
+            losses,
+            images,
+            d_images,
+            gradients: spans.gradients(&gradients),
+        }
     }
 
     fn put_parameters(&self, tape: &mut Tape) -> Spans {
         let put = |(name, rows, cols): (String, usize, usize)| {
-            let value = self.params.get(&name).unwrap_or_else(|| panic!("no values for the parameter span {name}"));
+            let value = self
+                .params
+                .get(&name)
+                .unwrap_or_else(|| panic!("no values for the parameter span {name}"));
             assert_eq!(value.len(), rows * cols, "{name} is {rows} x {cols}");
             let var = tape.parameter(rows, cols, value.clone());
             (name, var)
@@ -187,8 +293,13 @@ impl Step {
 
     /// o + t d for `bins` distances per ray.
     fn points_at(&self, bins: usize, distances: &[f64]) -> Vec<[f64; 3]> {
-        let point =
-            |(i, &t): (usize, &f64)| sampling::point_on_ray(self.rays.origins[i / bins], self.rays.directions[i / bins], t);
+        let point = |(i, &t): (usize, &f64)| {
+            sampling::point_on_ray(
+                self.rays.origins[i / bins],
+                self.rays.directions[i / bins],
+                t,
+            )
+        };
         distances.iter().enumerate().map(point).collect()
     }
 
@@ -198,15 +309,28 @@ impl Step {
             return sdf;
         }
         let samples = self.config.samples;
-        let outside: Vec<bool> = (0..sdf.len()).map(|i| stretches[i / samples].outside).collect();
-        let value = tape.value(sdf).iter().zip(&outside).map(|(&f, &outside)| if outside { 1000.0 } else { f }).collect();
-        tape.record(sdf.rows, sdf.cols, value, &[sdf], move |_, d_out, gradients| {
-            if let Some(d_sdf) = gradients.of(sdf) {
-                for ((d_sdf, d_out), &outside) in d_sdf.iter_mut().zip(d_out).zip(&outside) {
-                    *d_sdf += if outside { 0.0 } else { *d_out };
+        let outside: Vec<bool> = (0..sdf.len())
+            .map(|i| stretches[i / samples].outside)
+            .collect();
+        let value = tape
+            .value(sdf)
+            .iter()
+            .zip(&outside)
+            .map(|(&f, &outside)| if outside { 1000.0 } else { f })
+            .collect();
+        tape.record(
+            sdf.rows,
+            sdf.cols,
+            value,
+            &[sdf],
+            move |_, d_out, gradients| {
+                if let Some(d_sdf) = gradients.of(sdf) {
+                    for ((d_sdf, d_out), &outside) in d_sdf.iter_mut().zip(d_out).zip(&outside) {
+                        *d_sdf += if outside { 0.0 } else { *d_out };
+                    }
                 }
-            }
-        })
+            },
+        )
     }
 
     /// Codes of the rays' views `[N, width]`; zeros outside training.
@@ -221,14 +345,36 @@ impl Step {
         })
     }
 
-    fn sample_colors(&self, tape: &mut Tape, spans: &Spans, points: &[[f64; 3]], gradient: Var, features: Var) -> Var {
+    fn sample_colors(
+        &self,
+        tape: &mut Tape,
+        spans: &Spans,
+        points: &[[f64; 3]],
+        gradient: Var,
+        features: Var,
+    ) -> Var {
         let config = &self.config;
-        let ray_of_sample: Vec<usize> = (0..points.len()).map(|sample| sample / config.samples).collect();
-        let directions: Vec<[f64; 3]> = ray_of_sample.iter().map(|&ray| self.rays.directions[ray]).collect();
+        let ray_of_sample: Vec<usize> = (0..points.len())
+            .map(|sample| sample / config.samples)
+            .collect();
+        let directions: Vec<[f64; 3]> = ray_of_sample
+            .iter()
+            .map(|&ray| self.rays.directions[ray])
+            .collect();
         let codes = self.codes(tape, spans, "appearance", config.appearance);
         let codes = codes.map(|codes| tape.gather_rows(codes, ray_of_sample));
-        let layers: Vec<NormedLayer> = (0..=config.color_layers).map(|layer| spans.normed(&format!("color.{layer}"))).collect();
-        surface::color(tape, &layers, points, &directions, gradient, features, codes)
+        let layers: Vec<NormedLayer> = (0..=config.color_layers)
+            .map(|layer| spans.normed(&format!("color.{layer}")))
+            .collect();
+        surface::color(
+            tape,
+            &layers,
+            points,
+            &directions,
+            gradient,
+            features,
+            codes,
+        )
     }
 
     fn background(&self, tape: &mut Tape, spans: &Spans, stretches: &[Stretch]) -> Var {
@@ -252,7 +398,14 @@ impl Step {
                 let near: Vec<f64> = stretches.iter().map(|stretch| stretch.far).collect();
                 let draws = &self.draws.background;
                 let draws = (self.config.train && !draws.is_empty()).then_some(draws.as_slice());
-                field.render(tape, config, &self.rays.origins, &self.rays.directions, &near, draws)
+                field.render(
+                    tape,
+                    config,
+                    &self.rays.origins,
+                    &self.rays.directions,
+                    &near,
+                    draws,
+                )
             }
         }
     }
@@ -260,7 +413,10 @@ impl Step {
 
 impl Spans {
     fn gradients(&self, gradients: &Gradients) -> BTreeMap<String, Vec<f64>> {
-        self.0.iter().map(|(name, &var)| (name.clone(), gradients.get(var))).collect()
+        self.0
+            .iter()
+            .map(|(name, &var)| (name.clone(), gradients.get(var)))
+            .collect()
     }
 }
 

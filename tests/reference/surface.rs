@@ -87,7 +87,14 @@ pub fn color(
 ) -> Var {
     let n = points.len();
     let x = tape.constant(n, 3, points.iter().flatten().copied().collect());
-    let d = tape.constant(n, 27, directions.iter().flat_map(|&d| direction_encoding(d)).collect());
+    let d = tape.constant(
+        n,
+        27,
+        directions
+            .iter()
+            .flat_map(|&d| direction_encoding(d))
+            .collect(),
+    );
     let mut input = vec![x, d, gradient, features];
     input.extend(appearance);
     let input = tape.concat(&input);

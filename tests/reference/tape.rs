@@ -54,7 +54,11 @@ impl Gradients {
     /// The finished gradient; zeros where the loss does not depend on `var`.
     pub fn get(&self, var: Var) -> Vec<f64> {
         let gradient = &self.of_node[var.node];
-        if gradient.is_empty() { vec![0.0; var.len()] } else { gradient.clone() }
+        if gradient.is_empty() {
+            vec![0.0; var.len()]
+        } else {
+            gradient.clone()
+        }
     }
 }
 
@@ -70,9 +74,22 @@ impl Tape {
     }
 
     fn leaf(&mut self, rows: usize, cols: usize, value: Vec<f64>, needs_gradient: bool) -> Var {
-        assert_eq!(value.len(), rows * cols, "a {rows} x {cols} matrix of {} values", value.len());
-        self.nodes.push(Node { value, needs_gradient, adjoint: None });
-        Var { node: self.nodes.len() - 1, rows, cols }
+        assert_eq!(
+            value.len(),
+            rows * cols,
+            "a {rows} x {cols} matrix of {} values",
+            value.len()
+        );
+        self.nodes.push(Node {
+            value,
+            needs_gradient,
+            adjoint: None,
+        });
+        Var {
+            node: self.nodes.len() - 1,
+            rows,
+            cols,
+        }
     }
 
     /// Records the outcome of an operation on `inputs`, and its adjoint.
@@ -84,7 +101,9 @@ impl Tape {
         inputs: &[Var],
         adjoint: impl Fn(&Tape, &[f64], &mut Gradients) + 'static,
     ) -> Var {
-        let needs_gradient = inputs.iter().any(|input| self.nodes[input.node].needs_gradient);
+        let needs_gradient = inputs
+            .iter()
+            .any(|input| self.nodes[input.node].needs_gradient);
         let var = self.leaf(rows, cols, value, needs_gradient);
         if needs_gradient {
             self.nodes[var.node].adjoint = Some(Box::new(adjoint));
@@ -136,9 +155,17 @@ impl Tape {
     }
 
     /// y = f(x) element by element; `derivative` is given x and y.
-    pub fn map(&mut self, x: Var, f: impl Fn(f64) -> f64, derivative: impl Fn(f64, f64) -> f64 + 'static) -> Var {
+    pub fn map(
+        &mut self,
+        x: Var,
+        f: impl Fn(f64) -> f64,
+        derivative: impl Fn(f64, f64) -> f64 + 'static,
+    ) -> Var {
         let value: Vec<f64> = self.value(x).iter().map(|&x| f(x)).collect();
-        let y = Var { node: self.nodes.len(), ..x };
+        let y = Var {
+            node: self.nodes.len(),
+            ..x
+        };
         self.record(x.rows, x.cols, value, &[x], move |tape, d_y, gradients| {
             if let Some(d_x) = gradients.of(x) {
                 let values = tape.value(x).iter().zip(tape.value(y));
@@ -157,7 +184,12 @@ impl Tape {
     /// a + b
     pub fn add(&mut self, a: Var, b: Var) -> Var {
         assert_eq!((a.rows, a.cols), (b.rows, b.cols));
-        let value = self.value(a).iter().zip(self.value(b)).map(|(a, b)| a + b).collect();
+        let value = self
+            .value(a)
+            .iter()
+            .zip(self.value(b))
+            .map(|(a, b)| a + b)
+            .collect();
         self.record(a.rows, a.cols, value, &[a, b], move |_, d_y, gradients| {
             for input in [a, b] {
                 if let Some(d_x) = gradients.of(input) {
@@ -170,21 +202,36 @@ impl Tape {
     /// a · b, element by element.
     pub fn multiply(&mut self, a: Var, b: Var) -> Var {
         assert_eq!((a.rows, a.cols), (b.rows, b.cols));
-        let value = self.value(a).iter().zip(self.value(b)).map(|(a, b)| a * b).collect();
-        self.record(a.rows, a.cols, value, &[a, b], move |tape, d_y, gradients| {
-            for (input, other) in [(a, b), (b, a)] {
-                if let Some(d_x) = gradients.of(input) {
-                    for ((d_x, d_y), other) in d_x.iter_mut().zip(d_y).zip(tape.value(other)) {
-                        *d_x += d_y * other;
+        let value = self
+            .value(a)
+            .iter()
+            .zip(self.value(b))
+            .map(|(a, b)| a * b)
+            .collect();
+        self.record(
+            a.rows,
+            a.cols,
+            value,
+            &[a, b],
+            move |tape, d_y, gradients| {
+                for (input, other) in [(a, b), (b, a)] {
+                    if let Some(d_x) = gradients.of(input) {
+                        for ((d_x, d_y), other) in d_x.iter_mut().zip(d_y).zip(tape.value(other)) {
+                            *d_x += d_y * other;
+                        }
                     }
                 }
-            }
-        })
+            },
+        )
     }
 
     /// x Wᵀ for x `[n, inputs]` and W `[outputs, inputs]`.
     pub fn matmul_transposed(&mut self, x: Var, w: Var) -> Var {
-        assert_eq!(x.cols, w.cols, "a layer of {} inputs is given {}", w.cols, x.cols);
+        assert_eq!(
+            x.cols, w.cols,
+            "a layer of {} inputs is given {}",
+            w.cols, x.cols
+        );
         let (inputs, outputs) = (w.cols, w.rows);
         let mut value = Vec::with_capacity(x.rows * outputs);
         for x_row in self.value(x).chunks_exact(inputs) {
@@ -192,22 +239,36 @@ impl Tape {
                 value.push(x_row.iter().zip(w_row).map(|(x, w)| x * w).sum());
             }
         }
-        self.record(x.rows, outputs, value, &[x, w], move |tape, d_y, gradients| {
-            if let Some(d_x) = gradients.of(x) {
-                for (d_x, d_y) in d_x.chunks_exact_mut(inputs).zip(d_y.chunks_exact(outputs)) {
-                    for (w_row, d_y) in tape.value(w).chunks_exact(inputs).zip(d_y) {
-                        d_x.iter_mut().zip(w_row).for_each(|(d_x, w)| *d_x += d_y * w);
+        self.record(
+            x.rows,
+            outputs,
+            value,
+            &[x, w],
+            move |tape, d_y, gradients| {
+                if let Some(d_x) = gradients.of(x) {
+                    for (d_x, d_y) in d_x.chunks_exact_mut(inputs).zip(d_y.chunks_exact(outputs)) {
+                        for (w_row, d_y) in tape.value(w).chunks_exact(inputs).zip(d_y) {
+                            d_x.iter_mut()
+                                .zip(w_row)
+                                .for_each(|(d_x, w)| *d_x += d_y * w);
+                        }
                     }
                 }
-            }
-            if let Some(d_w) = gradients.of(w) {
-                for (x_row, d_y) in tape.value(x).chunks_exact(inputs).zip(d_y.chunks_exact(outputs)) {
-                    for (d_w, d_y) in d_w.chunks_exact_mut(inputs).zip(d_y) {
-                        d_w.iter_mut().zip(x_row).for_each(|(d_w, x)| *d_w += d_y * x);
+                if let Some(d_w) = gradients.of(w) {
+                    for (x_row, d_y) in tape
+                        .value(x)
+                        .chunks_exact(inputs)
+                        .zip(d_y.chunks_exact(outputs))
+                    {
+                        for (d_w, d_y) in d_w.chunks_exact_mut(inputs).zip(d_y) {
+                            d_w.iter_mut()
+                                .zip(x_row)
+                                .for_each(|(d_w, x)| *d_w += d_y * x);
+                        }
                     }
                 }
-            }
-        })
+            },
+        )
     }
 
     /// x + b in every row, for b `[1, cols]`.
@@ -236,14 +297,20 @@ impl Tape {
         for &row in &indices {
             value.extend_from_slice(&self.value(x)[row * cols..(row + 1) * cols]);
         }
-        self.record(indices.len(), cols, value, &[x], move |_, d_y, gradients| {
-            if let Some(d_x) = gradients.of(x) {
-                for (&row, d_y) in indices.iter().zip(d_y.chunks_exact(cols)) {
-                    let d_row = &mut d_x[row * cols..(row + 1) * cols];
-                    d_row.iter_mut().zip(d_y).for_each(|(d_x, d_y)| *d_x += d_y);
+        self.record(
+            indices.len(),
+            cols,
+            value,
+            &[x],
+            move |_, d_y, gradients| {
+                if let Some(d_x) = gradients.of(x) {
+                    for (&row, d_y) in indices.iter().zip(d_y.chunks_exact(cols)) {
+                        let d_row = &mut d_x[row * cols..(row + 1) * cols];
+                        d_row.iter_mut().zip(d_y).for_each(|(d_x, d_y)| *d_x += d_y);
+                    }
                 }
-            }
-        })
+            },
+        )
     }
 
     /// Rows `range` of x.
@@ -254,11 +321,18 @@ impl Tape {
     /// Columns `range` of x.
     pub fn columns(&mut self, x: Var, range: Range<usize>) -> Var {
         let width = range.len();
-        let value = self.value(x).chunks_exact(x.cols).flat_map(|row| row[range.clone()].to_vec()).collect();
+        let value = self
+            .value(x)
+            .chunks_exact(x.cols)
+            .flat_map(|row| row[range.clone()].to_vec())
+            .collect();
         self.record(x.rows, width, value, &[x], move |_, d_y, gradients| {
             if let Some(d_x) = gradients.of(x) {
                 for (d_row, d_y) in d_x.chunks_exact_mut(x.cols).zip(d_y.chunks_exact(width)) {
-                    d_row[range.clone()].iter_mut().zip(d_y).for_each(|(d_x, d_y)| *d_x += d_y);
+                    d_row[range.clone()]
+                        .iter_mut()
+                        .zip(d_y)
+                        .for_each(|(d_x, d_y)| *d_x += d_y);
                 }
             }
         })
@@ -282,7 +356,10 @@ impl Tape {
                 if let Some(d_x) = gradients.of(part) {
                     for row in 0..rows {
                         let d_part = &d_y[row * cols + first..][..part.cols];
-                        d_x[row * part.cols..][..part.cols].iter_mut().zip(d_part).for_each(|(d_x, d_y)| *d_x += d_y);
+                        d_x[row * part.cols..][..part.cols]
+                            .iter_mut()
+                            .zip(d_part)
+                            .for_each(|(d_x, d_y)| *d_x += d_y);
                     }
                 }
                 first += part.cols;

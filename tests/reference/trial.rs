@@ -45,7 +45,10 @@ pub fn config() -> StepConfig {
     StepConfig {
         region: Region::Sphere,
         train: true,
-        proposal_grids: [Grid::published(3, 4, 16, 9, 2), Grid::published(3, 4, 32, 9, 2)],
+        proposal_grids: [
+            Grid::published(3, 4, 16, 9, 2),
+            Grid::published(3, 4, 32, 9, 2),
+        ],
         proposal_hidden: 16,
         proposal_samples: [24, 16],
         samples: 12,
@@ -95,47 +98,73 @@ pub fn step(config: StepConfig, n: usize, seed: u64) -> Step {
             "surface.hidden.v" => {
                 let deviation = 2.0_f64.sqrt() / (config.hidden as f64).sqrt();
                 let value = |column: usize, random: &mut Random| {
-                    if column < 3 { random.normal() * deviation } else { random.symmetric(0.1) }
+                    if column < 3 {
+                        random.normal() * deviation
+                    } else {
+                        random.symmetric(0.1)
+                    }
                 };
                 (0..rows * cols).map(|i| value(i % cols, random)).collect()
             }
             "surface.heads.v" => {
                 let mean = side * PI.sqrt() / (config.hidden as f64).sqrt();
-                (0..rows * cols).map(|_| mean * (1.0 + random.symmetric(0.1))).collect()
+                (0..rows * cols)
+                    .map(|_| mean * (1.0 + random.symmetric(0.1)))
+                    .collect()
             }
-            "surface.heads.bias" => (0..cols).map(|_| -0.5 * side + random.symmetric(0.02)).collect(),
-            _ if name.ends_with("table") => (0..rows * cols).map(|_| random.symmetric(0.3)).collect(),
+            "surface.heads.bias" => (0..cols)
+                .map(|_| -0.5 * side + random.symmetric(0.02))
+                .collect(),
+            _ if name.ends_with("table") => {
+                (0..rows * cols).map(|_| random.symmetric(0.3)).collect()
+            }
             _ if name.ends_with(".g") => vec![0.0; rows],
             _ if name.ends_with(".bias") => (0..cols).map(|_| random.symmetric(0.1)).collect(),
-            "appearance" | "background.appearance" => (0..rows * cols).map(|_| random.normal()).collect(),
-            _ => (0..rows * cols).map(|_| random.symmetric((3.0 / cols as f64).sqrt())).collect(),
+            "appearance" | "background.appearance" => {
+                (0..rows * cols).map(|_| random.normal()).collect()
+            }
+            _ => (0..rows * cols)
+                .map(|_| random.symmetric((3.0 / cols as f64).sqrt()))
+                .collect(),
         };
         params.insert(name, values);
     }
     // g starts near ‖V‖, so that it is a parameter of its own.
-    let lengths: Vec<String> = params.keys().filter(|name| name.ends_with(".g")).cloned().collect();
+    let lengths: Vec<String> = params
+        .keys()
+        .filter(|name| name.ends_with(".g"))
+        .cloned()
+        .collect();
     for name in lengths {
         let v: &Vec<f64> = &params[&name.replace(".g", ".v")];
         let rows = params[&name].len();
         let length = |row: &[f64]| row.iter().map(|v| v * v).sum::<f64>().sqrt();
-        let g = v.chunks_exact(v.len() / rows).map(|row| length(row) * (1.0 + random.symmetric(0.05))).collect();
+        let g = v
+            .chunks_exact(v.len() / rows)
+            .map(|row| length(row) * (1.0 + random.symmetric(0.05)))
+            .collect();
         params.insert(name, g);
     }
 
     let mut rays = Rays::default();
     for ray in 0..n {
-        let origin = random.direction().map(|x| x * if inside { 0.2 } else { 1.6 });
+        let origin = random
+            .direction()
+            .map(|x| x * if inside { 0.2 } else { 1.6 });
         let towards: [f64; 3] = std::array::from_fn(|_| random.symmetric(0.5));
         let direction = if inside {
             random.direction()
         } else if ray + 1 == n {
-            normalized(std::array::from_fn(|axis| origin[axis] - 0.3 * towards[axis]))
+            normalized(std::array::from_fn(|axis| {
+                origin[axis] - 0.3 * towards[axis]
+            }))
         } else {
             normalized(std::array::from_fn(|axis| towards[axis] - origin[axis]))
         };
         rays.origins.push(origin);
         rays.directions.push(direction);
-        rays.target.push([random.uniform(), random.uniform(), random.uniform(), 1.0]);
+        rays.target
+            .push([random.uniform(), random.uniform(), random.uniform(), 1.0]);
         rays.view.push(ray % config.views);
     }
     let mut draw = |count: usize| -> Vec<f64> { (0..count).map(|_| random.uniform()).collect() };
@@ -147,6 +176,18 @@ pub fn step(config: StepConfig, n: usize, seed: u64) -> Step {
             _ => Vec::new(),
         },
     };
-    let now = Now { anneal: 0.8, inv_s_lower: 0.01, bias_weight: 0.1, inv_count: 1.0 / n as f64 };
-    Step { config, params, rays, draws, now, edges: None }
+    let now = Now {
+        anneal: 0.8,
+        inv_s_lower: 0.01,
+        bias_weight: 0.1,
+        inv_count: 1.0 / n as f64,
+    };
+    Step {
+        config,
+        params,
+        rays,
+        draws,
+        now,
+        edges: None,
+    }
 }
