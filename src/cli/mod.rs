@@ -1,5 +1,6 @@
 //! The command line: what was typed becomes what is meant; results go to stdout, everything else to stderr.
 
+pub mod demo;
 mod devices;
 mod diagnostics;
 mod inspect;
