@@ -312,3 +312,40 @@ impl Gpu {
         })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gpu::GpuOptions;
+    use crate::gpu::device::Inner;
+
+    #[test]
+    fn every_kernel_builds_in_both_variants_and_the_layer_agrees() -> Result<()> {
+        for portable in [false, true] {
+            let options = GpuOptions {
+                validation: true,
+                portable,
+                ..GpuOptions::default()
+            };
+            let gpu = Gpu::new(&options)?;
+            let Inner {
+                pipelines,
+                context,
+                info,
+                ..
+            } = &*gpu.inner;
+            for module in crate::kernels::ALL {
+                let pipeline = pipelines.build(context, info, module, &[])?;
+                // SAFETY: nothing uses it.
+                unsafe { context.device.destroy_pipeline(pipeline, None) };
+                assert_eq!(
+                    gpu.validation_messages(),
+                    Vec::<String>::new(),
+                    "{}",
+                    module.name
+                );
+            }
+        }
+        Ok(())
+    }
+}
