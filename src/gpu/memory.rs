@@ -4,7 +4,8 @@
 //! once more with an empty mask, and its uniform loads are not masked), and guard mode writes its words there. Memory whose last handle
 //! goes while submitted work may still use it waits for that work ([`super::queue`]).
 
-use super::device::{Context, DeviceInfo, DeviceKind, Gpu, Inner, vulkan};
+use super::device::{Context, Gpu, Inner, vulkan};
+use super::instance::{DeviceInfo, DeviceKind};
 use crate::{Error, Result};
 use ash::vk;
 use gpu_allocator::MemoryLocation;

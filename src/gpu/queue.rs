@@ -1,8 +1,10 @@
 //! Submission: one compute queue, one timeline semaphore that counts submissions, two calls of `submit` in flight.
 
 use super::device::{Context, Gpu, vulkan};
+use super::hazards::Hazards;
 use super::memory::{Memory, Parts};
-use super::recorder::{Hazards, Recorder};
+use super::profile::Stamps;
+use super::recorder::Recorder;
 use crate::Result;
 use ash::vk;
 use std::sync::Mutex;
@@ -37,6 +39,7 @@ pub(super) struct Slot {
     buffers: Vec<vk::CommandBuffer>,
     used: usize,
     last: u64,
+    pub(super) stamps: Stamps,
 }
 
 /// Memory whose owner is gone while the device may still use it: (value to wait for, memory).
@@ -71,6 +74,7 @@ impl Queue {
                 buffers: Vec::new(),
                 used: 0,
                 last: 0,
+                stamps: Stamps::default(),
             })
         };
         let slots = [slot()?, slot()?];
@@ -162,7 +166,8 @@ impl Drop for Queue {
             .unwrap_or_else(|poisoned| poisoned.into_inner());
         // SAFETY: collect_all has waited, and nobody is left to submit.
         unsafe {
-            for slot in &state.slots {
+            for slot in &mut state.slots {
+                slot.stamps.destroy(&self.device);
                 self.device.destroy_command_pool(slot.pool, None);
             }
             self.device.destroy_semaphore(self.timeline, None);
@@ -251,6 +256,9 @@ impl Gpu {
         }
         .map_err(vulkan("vkResetCommandPool"))?;
         slot.used = 0;
+        self.inner
+            .profiler
+            .take(self.inner.device(), &mut slot.stamps)?;
 
         queue.begin();
         let mut recorder = Recorder::new(self, &mut state, name);
@@ -277,6 +285,23 @@ impl Gpu {
             .submitted;
         self.inner.queue.wait(submitted)?;
         self.inner.queue.collect(&self.inner.memory, submitted);
+        Ok(())
+    }
+
+    /// Waits for everything and reads its timestamps.
+    pub(super) fn read_stamps(&self) -> Result<()> {
+        let queue = &self.inner.queue;
+        let mut state = queue
+            .state
+            .lock()
+            .unwrap_or_else(|poisoned| poisoned.into_inner());
+        queue.wait(state.submitted)?;
+        let older = 1 - state.current;
+        for slot in [older, 1 - older] {
+            self.inner
+                .profiler
+                .take(self.inner.device(), &mut state.slots[slot].stamps)?;
+        }
         Ok(())
     }
 
