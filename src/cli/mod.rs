@@ -1,1 +1,4 @@
 //! Module cli.
+
+pub mod inspect;
+pub mod scene_args;

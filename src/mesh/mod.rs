@@ -6,6 +6,7 @@
 pub mod bvh;
 pub mod clean;
 pub mod extract;
+pub mod field;
 pub mod marching_cubes;
 pub mod read;
 pub mod visibility;
@@ -16,6 +17,7 @@ use glam::DVec3;
 pub use extract::{
     Domain, ExtractOptions, ExtractStats, Lattice, Progress, SurfaceAttributes, extract_mesh,
 };
+pub use field::Field;
 pub use read::read_mesh;
 pub use write::{MeshFormat, write_mesh};
 

@@ -1,0 +1,637 @@
+//! COLMAP sparse models, binary and text: cameras, images, points3D (COLMAP, `doc/format.rst`).
+//!
+//! A pose is a unit quaternion (w, x, y, z) and a translation from world to camera, with y down and z forward. Binary files are
+//! little-endian with a 64-bit count in front; counts are never believed, only what the file holds. COLMAP 4 writes rigs and frames
+//! beside them; the poses are still in images, so those are not read.
+
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+
+use glam::{DMat4, DQuat, DVec3};
+
+use super::camera::UNSUPPORTED_MODELS;
+use super::{Camera, CameraModel, Format, Frame, FrameLens, Point, Reading, Skipped};
+use crate::{Error, Result};
+
+/// Where a model may lie below a dataset's directory.
+const PLACES: [&str; 7] = [
+    "sparse/0",
+    "sparse",
+    "colmap/sparse/0",
+    "colmap/sparse",
+    "colmap/0",
+    "colmap",
+    "",
+];
+
+/// Where pictures may lie below a dataset's directory.
+const IMAGE_FOLDERS: [&str; 6] = ["images", "image", "rgb", "input", "imgs", ""];
+
+/// The directory of the COLMAP model that belongs to the dataset at `path`, if there is one.
+pub(super) fn find_model(path: &Path) -> Option<PathBuf> {
+    PLACES
+        .into_iter()
+        .map(|place| {
+            if place.is_empty() {
+                path.to_path_buf()
+            } else {
+                path.join(place)
+            }
+        })
+        .find(|folder| part(folder, "cameras").is_some() || part(folder, "images").is_some())
+}
+
+/// One of a model's files: binary before text, as COLMAP has it.
+fn part(model: &Path, name: &str) -> Option<PathBuf> {
+    [".bin", ".txt"]
+        .into_iter()
+        .map(|ending| model.join(format!("{name}{ending}")))
+        .find(|file| file.is_file())
+}
+
+/// Reads `model` for the dataset at `path`.
+pub(super) fn read(path: &Path, model: &Path) -> Result<Reading> {
+    let require = |name: &str| {
+        part(model, name).ok_or_else(|| {
+            Error::input(
+                model,
+                format!("the COLMAP model lacks {name}.bin (or {name}.txt)"),
+                "copy all of cameras, images and points3D",
+            )
+        })
+    };
+    let (cameras_file, images_file) = (require("cameras")?, require("images")?);
+    let cameras = read_cameras(&cameras_file)?;
+    let mut images = read_images(&images_file)?;
+    images.sort_by(|a, b| a.name.cmp(&b.name));
+
+    let (mut skipped, mut notes) = (Vec::new(), Vec::new());
+    let points = match part(model, "points3D") {
+        Some(file) => read_points(&file, &mut notes)?,
+        None => {
+            skipped.push(Skipped {
+                what: "points3D".into(),
+                why: "not there: the region is guessed from the cameras alone".into(),
+            });
+            Vec::new()
+        }
+    };
+    note_other_models(model, &mut skipped);
+
+    let folder = image_folder(path, model, &images);
+    let mut frames = Vec::with_capacity(images.len());
+    for image in images {
+        let camera = cameras.get(&image.camera_id).ok_or_else(|| {
+            Error::input(
+                &images_file,
+                format!(
+                    "image {} refers to camera {}, which {} does not hold",
+                    image.name,
+                    image.camera_id,
+                    cameras_file.display()
+                ),
+                "export cameras and images together",
+            )
+        })?;
+        let file = folder.join(&image.name);
+        frames.push(Frame {
+            image: if file.is_file() {
+                Ok(file)
+            } else {
+                Err(format!("no such file: {}", file.display()))
+            },
+            mask: None,
+            lens: FrameLens::Stated(camera.clone()),
+            world_from_camera: image.world_from_camera,
+            split: None,
+            name: image.name,
+        });
+    }
+    Ok(Reading {
+        root: folder_root(path, &folder),
+        file: images_file,
+        format: Format::Colmap,
+        frames,
+        points,
+        region_hint: None,
+        skipped,
+        notes,
+        world_from_colmap: DMat4::IDENTITY,
+    })
+}
+
+/// The directory that masks are looked for in: the dataset's, or the one above the pictures if that lies elsewhere.
+fn folder_root(path: &Path, images: &Path) -> PathBuf {
+    if images.starts_with(path) {
+        path.to_path_buf()
+    } else {
+        images.parent().unwrap_or(images).to_path_buf()
+    }
+}
+
+/// The folder that holds most of the pictures: below the dataset, or below one of the directories around the model.
+fn image_folder(path: &Path, model: &Path, images: &[ImageRecord]) -> PathBuf {
+    let roots = std::iter::once(path).chain(model.ancestors().skip(1).take(3));
+    let candidates = roots.flat_map(|root| {
+        IMAGE_FOLDERS
+            .into_iter()
+            .map(move |folder| root.join(folder))
+    });
+    // A sample is enough to tell the folders apart.
+    let sample: Vec<_> = images.iter().step_by((images.len() / 32).max(1)).collect();
+    let mut best = (0, path.join("images"));
+    for folder in candidates.filter(|folder| folder.is_dir()) {
+        let there = sample
+            .iter()
+            .filter(|image| folder.join(&image.name).is_file())
+            .count();
+        if there > best.0 {
+            best = (there, folder);
+        }
+    }
+    best.1
+}
+
+/// COLMAP numbers the models that it could not join; only one of them is read.
+fn note_other_models(model: &Path, skipped: &mut Vec<Skipped>) {
+    if model.file_name().is_none_or(|name| name != "0") {
+        return;
+    }
+    for number in 1.. {
+        let other = model.with_file_name(number.to_string());
+        if part(&other, "images").is_none() {
+            break;
+        }
+        skipped.push(Skipped {
+            what: other.display().to_string(),
+            why: "another model of the same pictures, not joined to the first; give its own path to use it".into(),
+        });
+    }
+}
+
+/// Gives a transforms.json the points of the COLMAP model beside it, if both have their cameras in the same places.
+pub(super) fn adopt_points(reading: &mut Reading, model: &Path) {
+    let mut skip = |why: String| {
+        reading.skipped.push(Skipped {
+            what: model.display().to_string(),
+            why,
+        });
+    };
+    let other = match part(model, "images").map(|file| read_images(&file)) {
+        Some(Ok(images)) => images,
+        Some(Err(error)) => {
+            return skip(format!(
+                "transforms.json is used, and this COLMAP model is not readable: {error}"
+            ));
+        }
+        None => return skip("transforms.json is used; this COLMAP model has no images".into()),
+    };
+    if !reading.points.is_empty() {
+        return skip(
+            "transforms.json is used, with its own points; give this path to use the COLMAP model"
+                .into(),
+        );
+    }
+    let world = reading.world_from_colmap;
+    let base = |name: &str| name.rsplit('/').next().unwrap_or(name).to_owned();
+    let positions: HashMap<String, DVec3> = other
+        .iter()
+        .map(|image| {
+            let position = image.world_from_camera.w_axis.truncate();
+            (base(&image.name), world.transform_point3(position))
+        })
+        .collect();
+    let pairs: Vec<(DVec3, DVec3)> = reading
+        .frames
+        .iter()
+        .filter_map(|frame| {
+            Some((
+                frame.world_from_camera.w_axis.truncate(),
+                *positions.get(&base(&frame.name))?,
+            ))
+        })
+        .collect();
+    let mean = pairs.iter().map(|(here, _)| *here).sum::<DVec3>() / pairs.len().max(1) as f64;
+    let spread = pairs
+        .iter()
+        .map(|(here, _)| (*here - mean).length())
+        .sum::<f64>()
+        / pairs.len().max(1) as f64;
+    let agree = pairs
+        .iter()
+        .filter(|(here, there)| (*here - *there).length() <= 1e-3 * spread)
+        .count();
+    if pairs.len() < 3 || agree * 10 < pairs.len() * 9 {
+        return skip(format!(
+            "transforms.json is used; this COLMAP model has {agree} of {} cameras in the same places, so its points are of another frame",
+            reading.frames.len()
+        ));
+    }
+    let Some(file) = part(model, "points3D") else {
+        return skip("transforms.json is used; this COLMAP model has no points".into());
+    };
+    match read_points(&file, &mut reading.notes) {
+        Ok(mut points) => {
+            for point in &mut points {
+                point.position = world.transform_point3(point.position);
+            }
+            let agreeing = format!("{agree} of {} cameras agree", pairs.len());
+            reading.notes.push(format!(
+                "{} points are from {}: {agreeing}",
+                points.len(),
+                file.display()
+            ));
+            reading.points = points;
+        }
+        Err(error) => skip(format!("its points are not readable: {error}")),
+    }
+}
+
+/// An image's pose and name.
+struct ImageRecord {
+    name: String,
+    camera_id: u32,
+    world_from_camera: DMat4,
+}
+
+impl ImageRecord {
+    /// From COLMAP's world-to-camera quaternion (w, x, y, z) and translation.
+    fn new(file: &Path, name: String, camera_id: u32, q: [f64; 4], t: [f64; 3]) -> Result<Self> {
+        let bad_pose = |what: String| {
+            Error::input(
+                file,
+                format!("{name}: {what}"),
+                format!(
+                    "take {name} out of the model (colmap image_deleter), or export the poses again"
+                ),
+            )
+        };
+        if let Some(bad) = q.iter().chain(&t).find(|value| !value.is_finite()) {
+            return Err(bad_pose(format!("its pose holds {bad}")));
+        }
+        let quaternion = DQuat::from_xyzw(q[1], q[2], q[3], q[0]);
+        if !(quaternion.length() > 1e-6) {
+            return Err(bad_pose(format!(
+                "its rotation {q:?} is a quaternion of length 0"
+            )));
+        }
+        let camera_from_world =
+            DMat4::from_rotation_translation(quaternion.normalize(), DVec3::from(t));
+        let world_from_camera = super::rigid(camera_from_world.inverse()).map_err(bad_pose)?;
+        Ok(ImageRecord {
+            world_from_camera: super::opengl_from_opencv(world_from_camera),
+            name: name.replace('\\', "/"),
+            camera_id,
+        })
+    }
+}
+
+fn is_binary(file: &Path) -> bool {
+    file.extension().is_some_and(|extension| extension == "bin")
+}
+
+fn read_cameras(file: &Path) -> Result<HashMap<u32, Camera>> {
+    if is_binary(file) {
+        binary_cameras(file)
+    } else {
+        text_cameras(file)
+    }
+}
+
+fn read_images(file: &Path) -> Result<Vec<ImageRecord>> {
+    if is_binary(file) {
+        binary_images(file)
+    } else {
+        text_images(file)
+    }
+}
+
+/// Points with finite positions; how many have not is noted.
+fn read_points(file: &Path, notes: &mut Vec<String>) -> Result<Vec<Point>> {
+    let mut points = if is_binary(file) {
+        binary_points(file)?
+    } else {
+        text_points(file)?
+    };
+    let all = points.len();
+    points.retain(|point| point.position.is_finite());
+    if points.len() < all {
+        notes.push(format!(
+            "{} of {all} points in {} are not finite and left out",
+            all - points.len(),
+            file.display()
+        ));
+    }
+    Ok(points)
+}
+
+fn camera_from(
+    file: &Path,
+    id: u32,
+    model: CameraModel,
+    size: (u64, u64),
+    params: Vec<f64>,
+) -> Result<Camera> {
+    let side = |pixels: u64| u32::try_from(pixels).unwrap_or(u32::MAX);
+    Camera::new(model, side(size.0), side(size.1), params).map_err(|what| {
+        Error::input(
+            file,
+            format!("camera {id}: {what}"),
+            "correct or recompute the camera",
+        )
+    })
+}
+
+fn unsupported(file: &Path, id: u32, name: &str) -> Error {
+    Error::input(
+        file,
+        format!(
+            "camera {id} has the model {name}, which is not supported; models 0 (SIMPLE_PINHOLE) to 10 (THIN_PRISM_FISHEYE) are"
+        ),
+        "undistort the pictures with `colmap image_undistorter`, or use one of those models",
+    )
+}
+
+// Binary.
+
+/// A binary file in memory and the place that was read up to.
+struct Bytes<'a> {
+    file: &'a Path,
+    data: Vec<u8>,
+    at: usize,
+}
+
+impl<'a> Bytes<'a> {
+    fn open(file: &'a Path) -> Result<Self> {
+        let data = std::fs::read(file).map_err(|source| Error::io(file, source))?;
+        Ok(Bytes { file, data, at: 0 })
+    }
+
+    /// The next `count` bytes, which are (part of) `what`.
+    fn take(&mut self, count: u64, what: &dyn Fn() -> String) -> Result<&[u8]> {
+        let left = (self.data.len() - self.at) as u64;
+        if count > left {
+            return Err(Error::input(
+                self.file,
+                format!(
+                    "ends within {}: at byte {} it takes {count} more, but the file has {} bytes",
+                    what(),
+                    self.at,
+                    self.data.len()
+                ),
+                "the file is truncated or damaged: copy it again, or export the model again",
+            ));
+        }
+        let start = self.at;
+        self.at += count as usize;
+        Ok(&self.data[start..self.at])
+    }
+
+    fn array<const N: usize>(&mut self, what: &dyn Fn() -> String) -> Result<[u8; N]> {
+        Ok(self
+            .take(N as u64, what)?
+            .try_into()
+            .expect("N bytes were taken"))
+    }
+
+    fn u32(&mut self, what: &dyn Fn() -> String) -> Result<u32> {
+        self.array(what).map(u32::from_le_bytes)
+    }
+
+    fn u64(&mut self, what: &dyn Fn() -> String) -> Result<u64> {
+        self.array(what).map(u64::from_le_bytes)
+    }
+
+    fn f64s<const N: usize>(&mut self, what: &dyn Fn() -> String) -> Result<[f64; N]> {
+        let mut values = [0.0; N];
+        for value in &mut values {
+            *value = f64::from_le_bytes(self.array(what)?);
+        }
+        Ok(values)
+    }
+
+    /// A count in front of records of at least `smallest` bytes: what the file cannot hold is refused before anything is allocated.
+    fn count(&mut self, smallest: u64, records: &str) -> Result<usize> {
+        let count = self.u64(&|| format!("the number of {records}"))?;
+        let left = (self.data.len() - self.at) as u64;
+        if count > left / smallest {
+            return Err(Error::input(
+                self.file,
+                format!(
+                    "says that {count} {records} follow byte {}, each of {smallest} bytes or more, but the file has {} bytes",
+                    self.at,
+                    self.data.len()
+                ),
+                "the file is truncated or damaged: copy it again, or export the model again",
+            ));
+        }
+        Ok(count as usize)
+    }
+}
+
+fn binary_cameras(file: &Path) -> Result<HashMap<u32, Camera>> {
+    let mut bytes = Bytes::open(file)?;
+    let count = bytes.count(48, "cameras")?;
+    let mut cameras = HashMap::with_capacity(count);
+    for number in 1..=count {
+        let what = || format!("camera {number} of {count}");
+        let (id, model_id) = (bytes.u32(&what)?, bytes.u32(&what)?);
+        let Some(model) = CameraModel::from_id(model_id) else {
+            // The model says how many parameters follow: behind an unknown one nothing can be read.
+            let name = UNSUPPORTED_MODELS
+                .into_iter()
+                .find(|(known, _)| *known == model_id);
+            return Err(match name {
+                Some((_, name)) => unsupported(file, id, &format!("{name} (number {model_id})")),
+                None => unsupported(file, id, &format!("number {model_id}, unknown to COLMAP 4")),
+            });
+        };
+        let size = (bytes.u64(&what)?, bytes.u64(&what)?);
+        let mut params = vec![0.0; model.param_count()];
+        for param in &mut params {
+            [*param] = bytes.f64s(&what)?;
+        }
+        cameras.insert(id, camera_from(file, id, model, size, params)?);
+    }
+    Ok(cameras)
+}
+
+fn binary_images(file: &Path) -> Result<Vec<ImageRecord>> {
+    let mut bytes = Bytes::open(file)?;
+    let count = bytes.count(73, "images")?;
+    let mut images = Vec::with_capacity(count);
+    for number in 1..=count {
+        let what = || format!("image {number} of {count}");
+        bytes.u32(&what)?; // COLMAP's number for it
+        let (q, t) = (bytes.f64s::<4>(&what)?, bytes.f64s::<3>(&what)?);
+        let camera_id = bytes.u32(&what)?;
+        let rest = &bytes.data[bytes.at..];
+        let length = rest
+            .iter()
+            .position(|byte| *byte == 0)
+            .unwrap_or(rest.len());
+        let name = bytes.take(length as u64 + 1, &|| {
+            format!("the name of image {number} of {count}")
+        })?;
+        let name = String::from_utf8_lossy(&name[..length]).into_owned();
+        let observations = bytes.count(24, "observed points of an image")?;
+        bytes.take(observations as u64 * 24, &what)?;
+        images.push(ImageRecord::new(file, name, camera_id, q, t)?);
+    }
+    Ok(images)
+}
+
+fn binary_points(file: &Path) -> Result<Vec<Point>> {
+    let mut bytes = Bytes::open(file)?;
+    let count = bytes.count(51, "points")?;
+    let mut points = Vec::with_capacity(count);
+    for number in 1..=count {
+        let what = || format!("point {number} of {count}");
+        bytes.u64(&what)?;
+        let position = DVec3::from(bytes.f64s::<3>(&what)?);
+        let color = bytes.array(&what)?;
+        bytes.f64s::<1>(&what)?; // reprojection error
+        let track = bytes.count(8, "observations of a point")?;
+        bytes.take(track as u64 * 8, &what)?;
+        points.push(Point { position, color });
+    }
+    Ok(points)
+}
+
+// Text.
+
+/// A text file's lines, with what is needed to say which of them is wrong.
+struct Lines<'a> {
+    file: &'a Path,
+    text: String,
+}
+
+/// One line's words.
+struct Words<'a> {
+    file: &'a Path,
+    line: usize,
+    rest: &'a str,
+}
+
+impl<'a> Lines<'a> {
+    fn open(file: &'a Path) -> Result<Self> {
+        let data = std::fs::read(file).map_err(|source| Error::io(file, source))?;
+        let text = String::from_utf8_lossy(&data).into_owned();
+        Ok(Lines { file, text })
+    }
+
+    /// All lines with their numbers from 1.
+    fn all(&self) -> impl Iterator<Item = Words<'_>> {
+        self.text.lines().enumerate().map(|(index, line)| Words {
+            file: self.file,
+            line: index + 1,
+            rest: line.trim(),
+        })
+    }
+}
+
+impl<'a> Words<'a> {
+    fn is_comment_or_empty(&self) -> bool {
+        self.rest.is_empty() || self.rest.starts_with('#')
+    }
+
+    fn error(&self, what: impl std::fmt::Display) -> Error {
+        Error::input(
+            self.file,
+            format!("line {}: {what}", self.line),
+            "the file is truncated or damaged: copy it again, or export the model again",
+        )
+    }
+
+    fn word(&mut self, name: &str) -> Result<&'a str> {
+        let word = self.rest.split_whitespace().next();
+        let Some(word) = word else {
+            return Err(self.error(format!("ends before {name}")));
+        };
+        self.rest = self.rest[word.len()..].trim_start();
+        Ok(word)
+    }
+
+    fn number<T: std::str::FromStr>(&mut self, name: &str) -> Result<T> {
+        let word = self.word(name)?;
+        word.parse()
+            .map_err(|_| self.error(format!("{word:?} cannot be {name}")))
+    }
+
+    fn numbers<const N: usize>(&mut self, name: &str) -> Result<[f64; N]> {
+        let mut values = [0.0; N];
+        for value in &mut values {
+            *value = self.number(name)?;
+        }
+        Ok(values)
+    }
+}
+
+fn text_cameras(file: &Path) -> Result<HashMap<u32, Camera>> {
+    let lines = Lines::open(file)?;
+    let mut cameras = HashMap::new();
+    for mut words in lines.all().filter(|words| !words.is_comment_or_empty()) {
+        let id = words.number("a camera's number")?;
+        let name = words.word("a camera model")?;
+        let Some(model) = CameraModel::from_name(name) else {
+            return Err(unsupported(file, id, name));
+        };
+        let size = (words.number("the width")?, words.number("the height")?);
+        let mut params = Vec::new();
+        while !words.rest.is_empty() {
+            params.push(words.number("a camera parameter")?);
+        }
+        cameras.insert(id, camera_from(file, id, model, size, params)?);
+    }
+    Ok(cameras)
+}
+
+fn text_images(file: &Path) -> Result<Vec<ImageRecord>> {
+    let lines = Lines::open(file)?;
+    let mut images = Vec::new();
+    let mut lines = lines.all();
+    while let Some(mut words) = lines.next() {
+        if words.is_comment_or_empty() {
+            continue;
+        }
+        words.number::<u32>("an image's number")?;
+        let q = words.numbers::<4>("an entry of the quaternion")?;
+        let t = words.numbers::<3>("an entry of the translation")?;
+        let camera_id = words.number("the camera's number")?;
+        if words.rest.is_empty() {
+            return Err(words.error("ends before the picture's name"));
+        }
+        images.push(ImageRecord::new(
+            file,
+            words.rest.to_owned(),
+            camera_id,
+            q,
+            t,
+        )?);
+        // The second line, which may be empty, holds (x, y, point) for every feature.
+        if let Some(observed) = lines.next() {
+            let count = observed.rest.split_whitespace().count();
+            if count % 3 != 0 {
+                return Err(observed.error(format!(
+                    "{count} numbers are no list of x, y, point (an image takes two lines, the second may be empty)"
+                )));
+            }
+        }
+    }
+    Ok(images)
+}
+
+fn text_points(file: &Path) -> Result<Vec<Point>> {
+    let lines = Lines::open(file)?;
+    let mut points = Vec::new();
+    for mut words in lines.all().filter(|words| !words.is_comment_or_empty()) {
+        words.number::<u64>("a point's number")?;
+        let position = DVec3::from(words.numbers::<3>("a coordinate")?);
+        let mut color = [0; 3];
+        for channel in &mut color {
+            *channel = words.number("a colour from 0 to 255")?;
+        }
+        points.push(Point { position, color });
+    }
+    Ok(points)
+}
