@@ -149,7 +149,12 @@ pub(super) fn note_checkpoint(path: &Path) {
 /// A crash says what, where, on which device, at which step, and where the last checkpoint is.
 pub(super) fn install_panic_hook() {
     std::panic::set_hook(Box::new(|panic| {
-        let what = panic.payload_as_str().unwrap_or("a panic without words");
+        let payload = panic.payload();
+        let what = payload
+            .downcast_ref::<&str>()
+            .copied()
+            .or_else(|| payload.downcast_ref::<String>().map(String::as_str))
+            .unwrap_or("a panic without words");
         let place = panic
             .location()
             .map(ToString::to_string)

@@ -5,8 +5,11 @@ mod devices;
 mod diagnostics;
 mod inspect;
 mod interrupt;
+mod mesh;
 mod output;
+mod profile;
 mod progress;
+mod render;
 mod scene_args;
 mod settings;
 mod train;
@@ -114,6 +117,9 @@ enum Command {
     Devices(devices::DevicesArgs),
     Inspect(inspect::InspectArgs),
     Train(Box<train::TrainArgs>),
+    Mesh(mesh::MeshArgs),
+    Render(render::RenderArgs),
+    Profile(Box<profile::ProfileArgs>),
 }
 
 impl Command {
@@ -122,6 +128,9 @@ impl Command {
             Command::Devices(args) => devices::run(args, context),
             Command::Inspect(args) => inspect::run(args, context),
             Command::Train(args) => train::run(args, context),
+            Command::Mesh(args) => mesh::run(args, context),
+            Command::Render(args) => render::run(args, context),
+            Command::Profile(args) => profile::run(args, context),
         }
     }
 }

@@ -5,6 +5,7 @@ use super::scene_args::SceneArgs;
 use super::settings::SettingsArgs;
 use super::{Context, diagnostics, interrupt};
 use crate::config::{Config, Effect, MaskUse, RegionKind};
+use crate::gpu::Gpu;
 use crate::scene::{Facing, Looks, Region, RegionOverrides, RegionShape, Scene, Split};
 use crate::train::Trainer;
 use crate::train::checkpoint::{self, Latest};
@@ -61,7 +62,9 @@ pub(super) fn run(args: &TrainArgs, context: &Context) -> anyhow::Result<()> {
     let task = match (args.resume, args.print_config) {
         (true, true) => return Ok(context.print(&resumed(args, out)?.config.to_toml())?),
         (true, false) => resume(args, out, context)?,
-        (false, true) => return Ok(context.print(&described(args)?.to_toml())?),
+        (false, true) => {
+            return Ok(context.print(&described(&args.settings, &args.scene)?.to_toml())?);
+        }
         (false, false) => begin(args, out, context)?,
     };
     if args.dry_run {
@@ -90,9 +93,47 @@ fn with_scene_flags(args: &SceneArgs, config: Config) -> Result<Config> {
 }
 
 /// The settings for a new run, as far as they are known without looking at its dataset.
-fn described(args: &TrainArgs) -> Result<Config> {
-    let config = args.settings.resolve(Config::preset("outdoor-tiny")?)?;
-    with_scene_flags(&args.scene, config)
+fn described(settings: &SettingsArgs, scene: &SceneArgs) -> Result<Config> {
+    with_scene_flags(scene, settings.resolve(Config::preset("outdoor-tiny")?)?)
+}
+
+/// The settings for a new run on a dataset, and why its preset was chosen if it was not named.
+pub(super) fn configure(
+    settings: &SettingsArgs,
+    flags: &SceneArgs,
+    scene: &Scene,
+) -> Result<(Config, String)> {
+    if settings.names_preset()? {
+        return Ok((described(settings, flags)?, String::new()));
+    }
+    let looks = Looks::of(scene);
+    let (name, kind) = match looks.facing {
+        Facing::Inward => ("outdoor-tiny", "inwards"),
+        Facing::Outward => ("indoor-tiny", "outwards"),
+    };
+    let config = with_scene_flags(flags, settings.resolve(Config::preset(name)?)?)?;
+    Ok((
+        config,
+        format!(" (the cameras look {kind}; --preset chooses another)"),
+    ))
+}
+
+/// What flags and settings say of the region.
+pub(super) fn region_wanted(flags: &SceneArgs, config: &Config) -> RegionOverrides {
+    flags.overrides(&RegionOverrides {
+        scale: config.scene.region_scale,
+        prefer_box: config.scene.shape == RegionKind::Box,
+        ..RegionOverrides::default()
+    })
+}
+
+/// The dataset as the flags say it should be read; no preset says otherwise.
+pub(super) fn open_scene(
+    settings: &SettingsArgs,
+    flags: &SceneArgs,
+    dataset: &Path,
+) -> Result<Scene> {
+    Scene::open(dataset, &scene_options(&described(settings, flags)?))
 }
 
 /// Everything a run needs, on the device, with nothing written yet.
@@ -110,27 +151,9 @@ struct Task {
 fn begin(args: &TrainArgs, out: &Path, context: &Context) -> anyhow::Result<Task> {
     RunDirectory::check_free(out, args.force)?;
     let dataset = args.dataset.as_deref().expect("clap requires it");
-    let mut config = described(args)?;
-    let scene = Scene::open(dataset, &scene_options(&config))?;
-    let looks = Looks::of(&scene);
-    let mut chosen = String::new();
-    if !args.settings.names_preset()? {
-        let name = match looks.facing {
-            Facing::Inward => "outdoor-tiny",
-            Facing::Outward => "indoor-tiny",
-        };
-        config = args.settings.resolve(Config::preset(name)?)?;
-        config = with_scene_flags(&args.scene, config)?;
-        chosen = format!(" (since {}; --preset chooses another)", looks.why);
-    }
-    let region = Region::estimate(
-        &scene,
-        &args.scene.overrides(&RegionOverrides {
-            scale: config.scene.region_scale,
-            prefer_box: config.scene.shape == RegionKind::Box,
-            ..RegionOverrides::default()
-        }),
-    )?;
+    let scene = open_scene(&args.settings, &args.scene, dataset)?;
+    let (config, chosen) = configure(&args.settings, &args.scene, &scene)?;
+    let region = Region::estimate(&scene, &region_wanted(&args.scene, &config))?;
     context.say(&format!(
         "dataset  {}, {}: {} views to train on, {} held out{}",
         dataset.display(),
@@ -148,8 +171,8 @@ fn begin(args: &TrainArgs, out: &Path, context: &Context) -> anyhow::Result<Task
         config.preset, config.steps, config.seed
     ));
     let gpu = context.gpu()?;
-    context.say(&format!("device   {}", gpu.info().name));
     let trainer = Trainer::new(&gpu, &scene, &region, &config)?;
+    say_device(&gpu, args.dry_run, context);
     Ok(Task {
         out: out.into(),
         record: SceneRecord::new(dataset, &scene, &region)?,
@@ -158,6 +181,22 @@ fn begin(args: &TrainArgs, out: &Path, context: &Context) -> anyhow::Result<Task
         trainer,
         resumed: None,
     })
+}
+
+/// The device, and what of its memory is used from here to the end: everything is allocated before the first step.
+fn say_device(gpu: &Gpu, in_full: bool, context: &Context) {
+    let plan = gpu.memory_plan();
+    let mib = |bytes: u64| bytes as f64 / f64::from(1 << 20);
+    context.say(&format!(
+        "device   {}: {:.0} MiB in {} buffers, of {:.0} MiB",
+        gpu.info().name,
+        mib(plan.total),
+        plan.buffers.len(),
+        mib(plan.budget)
+    ));
+    if in_full {
+        context.say(&plan.to_string());
+    }
 }
 
 fn in_words(region: &Region) -> String {
@@ -240,9 +279,9 @@ fn resume(args: &TrainArgs, out: &Path, context: &Context) -> anyhow::Result<Tas
     let record = SceneRecord::load(&run)?;
     let scene = record.open(args.dataset.as_deref(), &config)?;
     let gpu = context.gpu()?;
-    context.say(&format!("device   {}", gpu.info().name));
     let mut trainer = Trainer::new(&gpu, &scene, &state.region, &config)?;
     trainer.restore(&latest.checkpoint)?;
+    say_device(&gpu, args.dry_run, context);
     diagnostics::note_checkpoint(latest.checkpoint.path());
     Ok(Task {
         out: out.into(),

@@ -6,6 +6,7 @@ pub mod report;
 mod run;
 pub mod run_directory;
 pub mod schedule;
+pub mod trained;
 
 use glam::DMat4;
 
