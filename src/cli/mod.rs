@@ -3,6 +3,7 @@
 pub mod demo;
 mod devices;
 mod diagnostics;
+pub mod eval;
 mod inspect;
 mod interrupt;
 mod mesh;
@@ -119,6 +120,7 @@ enum Command {
     Train(Box<train::TrainArgs>),
     Mesh(mesh::MeshArgs),
     Render(render::RenderArgs),
+    Eval(eval::EvalArgs),
     Profile(Box<profile::ProfileArgs>),
 }
 
@@ -130,6 +132,7 @@ impl Command {
             Command::Train(args) => train::run(args, context),
             Command::Mesh(args) => mesh::run(args, context),
             Command::Render(args) => render::run(args, context),
+            Command::Eval(args) => eval::run(args, context),
             Command::Profile(args) => profile::run(args, context),
         }
     }

@@ -76,10 +76,12 @@ pub(super) enum What {
     Normal,
 }
 
+/// Appearance codes by the names that settings give them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub(super) enum Appearance {
+pub enum Appearance {
     Zero,
     Mean,
+    /// The view's own, where it was trained with
     Frame,
 }
 

@@ -9,6 +9,7 @@ use glam::{DMat4, DVec2, DVec3};
 use rayon::prelude::*;
 
 use super::Mesh;
+use crate::scene::View;
 
 /// A camera as far as seeing is concerned.
 pub trait Viewpoint: Sync {
@@ -18,6 +19,20 @@ pub trait Viewpoint: Sync {
     fn size(&self) -> [u32; 2];
     /// Pixel (centres at +0.5) of a point in the camera's frame; `None` if no pixel can show it. May lie outside the image.
     fn project(&self, p_camera: DVec3) -> Option<DVec2>;
+}
+
+impl Viewpoint for View {
+    fn world_from_camera(&self) -> DMat4 {
+        self.world_from_camera
+    }
+
+    fn size(&self) -> [u32; 2] {
+        [self.camera.width, self.camera.height]
+    }
+
+    fn project(&self, p_camera: DVec3) -> Option<DVec2> {
+        self.camera.project(p_camera)
+    }
 }
 
 /// How visibility is decided.
