@@ -1,9 +1,17 @@
-//! Every hyper-parameter, with its default and its reason.
+//! Every hyper-parameter of a training run.
 //!
-//! The defaults are NeuRodin's stage 1, outdoor-large (METHOD tables, "Configurations"); presets differ from them in a handful of
-//! fields. A `Config` is never written to after construction: what changes with time is computed by `train::schedule` from the step.
+//! Values, units and reasons stand in `config/presets/outdoor-large.toml`, which is NeuRodin's stage 1 for large outdoor scenes and the
+//! default; the other presets are lists of differences from it. A `Config` is never written to after construction: what changes with
+//! time is computed by [`crate::train::schedule`] from the step.
 
 use serde::{Deserialize, Serialize};
+
+mod difference;
+mod resolve;
+mod validate;
+
+pub use difference::{Difference, Effect};
+pub use resolve::{PRESETS, Preset};
 
 /// All settings of a training run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -28,19 +36,20 @@ pub struct Config {
     pub background: BackgroundConfig,
     pub loss: LossConfig,
     pub optimizer: OptimizerConfig,
+    pub report: ReportConfig,
 }
 
 /// How the dataset is read, and the region that the surface may occupy.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SceneConfig {
-    /// "sphere", "box" or "auto" (sphere outdoors, box indoors).
+    /// Sphere (objects, outdoors) or axis-parallel box (rooms).
     pub shape: RegionKind,
     /// The estimated (or given) region is enlarged by this factor.
     pub region_scale: f64,
     /// Every n-th view is held out where the dataset has no split of its own; 0 keeps all.
     pub holdout: u32,
-    /// Images are reduced by this factor.
+    /// Width and height of the images are divided by this (2 halves them).
     pub downscale: f64,
     /// What a mask or alpha channel means.
     pub masks: MaskUse,
@@ -220,7 +229,7 @@ pub struct OptimizerConfig {
     pub epsilon: f64,
 }
 
-/// Linear warm-up, then a factor `gamma` at each milestone (schedule steps).
+/// A constant rate with a linear warm-up from 0, then a factor `gamma` at each milestone (schedule steps).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct MultiStep {
@@ -229,6 +238,18 @@ pub struct MultiStep {
     pub warmup: u64,
     pub milestones: Vec<u64>,
     pub gamma: f64,
+    /// On which side of a milestone its factor begins.
+    pub drop: Drop,
+}
+
+/// The two conventions that the published schedules mix.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Drop {
+    /// The step at the milestone has the new rate (proposal networks).
+    At,
+    /// The step at the milestone still has the old one (fields and table).
+    After,
 }
 
 /// Exponential decay from `learning_rate` to `learning_rate_end` over the schedule.
@@ -238,4 +259,20 @@ pub struct Exponential {
     pub learning_rate: f64,
     pub learning_rate_end: f64,
     pub weight_decay: f64,
+}
+
+/// How often a run tells and saves; nothing here changes what is learned. In steps of the run, not of the schedule.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ReportConfig {
+    /// Between two lines of the log.
+    pub log_steps: u64,
+    /// Between two previews of a held-out view; 0 for none.
+    pub preview_steps: u64,
+    /// A preview is reduced to at most this many pixels.
+    pub preview_pixels: u64,
+    /// Between two checkpoints; 0 for one at the end (and on interruption) only.
+    pub checkpoint_steps: u64,
+    /// Complete checkpoints that stay in the run directory.
+    pub keep: u32,
 }

@@ -1,1 +1,3 @@
-//! What build.rs generated from glsl/.
+//! What build.rs generated from glsl/: one module per kernel, one structure per GLSL structure behind a pointer.
+
+include!(concat!(env!("OUT_DIR"), "/kernels.rs"));

@@ -1,1 +1,50 @@
-//! Module model.
+//! The learned functions and their parameters: what a point, a ray or an image is mapped to. Knows nothing of steps.
+
+mod background;
+mod field;
+mod hash_grid;
+mod layer;
+mod params;
+mod proposal;
+mod surface;
+
+pub use background::{Background, BackgroundBuffers, BackgroundRays};
+pub use field::{Field, FieldBuffers, FieldShape, Scratch};
+pub use hash_grid::HashGrid;
+pub use layer::{Activation, Layer};
+pub use params::{Group, Init, Params, ParamsPlan, Span, WeightHandle};
+pub use proposal::{Proposal, ProposalBuffers};
+pub use surface::{ShadeInputs, Surface, SurfaceBuffers};
+
+use crate::Result;
+use crate::config::Config;
+use crate::gpu::Gpu;
+
+/// Everything that is learned.
+pub struct Model {
+    pub params: Params,
+    pub surface: Surface,
+    pub proposals: Vec<Proposal>,
+    pub background: Background,
+    /// Number of training views, each with an appearance code; the row after them is the code for evaluation.
+    pub n_views: u32,
+}
+
+impl Model {
+    /// Builds and initialises the model of a configuration for `n_views` training views.
+    pub fn new(gpu: &Gpu, config: &Config, n_views: u32) -> Result<Model> {
+        let mut plan = ParamsPlan::default();
+        let surface = Surface::new(gpu, config, &mut plan, n_views + 1)?;
+        let proposals = (0..2)
+            .map(|level| Proposal::new(gpu, config, &mut plan, level))
+            .collect::<Result<_>>()?;
+        let background = Background::new(gpu, config, &mut plan, n_views + 1)?;
+        Ok(Model {
+            params: plan.build(gpu, config.seed)?,
+            surface,
+            proposals,
+            background,
+            n_views,
+        })
+    }
+}

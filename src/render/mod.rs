@@ -1,1 +1,13 @@
-//! Module render.
+//! Rays in, images and gradients out: where samples lie, what a ray sees, what is wrong with it.
+
+mod composite;
+mod loss;
+mod rays;
+mod renderer;
+mod sampler;
+
+pub use composite::{Composite, Look};
+pub use loss::{Loss, LossScales, TERMS};
+pub use rays::{RayDraws, Rays, ViewTable};
+pub use renderer::{Annealed, Rendered, Renderer, TRAINING};
+pub use sampler::Sampler;

@@ -12,6 +12,7 @@ mod colmap;
 mod images;
 mod points;
 mod preview;
+pub mod synthetic;
 mod transforms;
 
 use std::collections::HashSet;

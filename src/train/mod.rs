@@ -1,1 +1,288 @@
-//! Module train.
+//! Optimiser steps, their schedules, what is saved of them and what is told about them.
+
+mod adam;
+pub mod schedule;
+
+use glam::DMat4;
+
+use crate::Result;
+use crate::config::{AppearanceAtEval, Config};
+use crate::gpu::{Gpu, Readback, Recorder, Ticket};
+use crate::model::{Background, Model, Proposal, Scratch, Surface};
+use crate::render::{Annealed, Loss, LossScales, Rendered, Renderer, TERMS, TRAINING, ViewTable};
+use crate::scene::{Camera, Region, Scene, Split};
+use adam::Adam;
+use schedule::{Now, Schedule};
+
+/// Trains a model on a scene: [`Trainer::step`] is one optimiser step.
+pub struct Trainer {
+    gpu: Gpu,
+    config: Config,
+    schedule: Schedule,
+    region: Region,
+    model: Model,
+    renderer: Renderer,
+    loss: Loss,
+    scratch: Scratch,
+    optimizer: Adam,
+    views: ViewTable,
+    /// Indices into the scene's views in the order of the device's table: training views, then held-out ones.
+    view_order: Vec<usize>,
+    step: u64,
+    /// Losses of the last steps, [LOSS_HISTORY, TERMS + 1], read without waiting.
+    history: Readback<f32>,
+    tickets: std::collections::VecDeque<(u64, Ticket)>,
+}
+
+/// Losses of one step by the names of [`TERMS`], the total last.
+#[derive(Clone, Debug)]
+pub struct StepLosses {
+    pub step: u64,
+    pub values: [f32; TERMS.len() + 1],
+}
+
+/// Steps whose losses stay readable.
+const LOSS_HISTORY: u64 = 64;
+
+impl Trainer {
+    /// Builds the model, uploads the training pictures and allocates everything that a step needs.
+    ///
+    /// # Errors
+    /// What reading a picture or allocating device memory fails with.
+    pub fn new(gpu: &Gpu, scene: &Scene, region: &Region, config: &Config) -> Result<Trainer> {
+        let training: Vec<usize> = scene.split(Split::Train).collect();
+        let held_out: Vec<usize> = scene.split(Split::Test).collect();
+        let others: Vec<(Camera, DMat4)> = held_out
+            .iter()
+            .map(|&v| {
+                (
+                    scene.views[v].camera.clone(),
+                    scene.views[v].world_from_camera,
+                )
+            })
+            .collect();
+        let pictures = training.iter().map(|&v| {
+            let view = &scene.views[v];
+            Ok((
+                view.camera.clone(),
+                view.world_from_camera,
+                scene.load_picture(v)?,
+            ))
+        });
+        let views = ViewTable::new(gpu, region, pictures, others.iter())?;
+
+        let n_rays = config.rays;
+        let model = Model::new(gpu, config, training.len() as u32)?;
+        let renderer = Renderer::new(gpu, config, &model, region, n_rays)?;
+        let loss = Loss::new(gpu, config, n_rays)?;
+        let scales = LossScales {
+            eikonal: config.loss.eikonal as f32,
+            interlevel: config.loss.interlevel as f32,
+        };
+        loss.set_terms(
+            gpu,
+            &renderer.surface.eikonal,
+            &renderer.sampler.interlevel_loss,
+            scales,
+        )?;
+        let s = &config.sampling;
+        let mut users = vec![
+            (Surface::field_shape(config), 7 * n_rays * s.samples),
+            (
+                Proposal::field_shape(config, 0),
+                n_rays * s.proposal_samples[0],
+            ),
+            (
+                Proposal::field_shape(config, 1),
+                n_rays * s.proposal_samples[1],
+            ),
+        ];
+        users.extend(
+            Background::field_shape(config)
+                .map(|shape| (shape, n_rays * config.background.samples)),
+        );
+        Ok(Trainer {
+            schedule: Schedule::new(config),
+            scratch: Scratch::new(gpu, &users)?,
+            optimizer: Adam::new(gpu, config)?,
+            history: gpu.readback("loss history", LOSS_HISTORY * (TERMS.len() as u64 + 1))?,
+            tickets: std::collections::VecDeque::new(),
+            view_order: training.into_iter().chain(held_out).collect(),
+            gpu: gpu.clone(),
+            config: config.clone(),
+            region: region.clone(),
+            step: 0,
+            model,
+            renderer,
+            loss,
+            views,
+        })
+    }
+
+    /// One optimiser step: a batch of pixels in, better parameters out. Returns once the work is handed to the device.
+    pub fn step(&mut self) -> Result<()> {
+        let now = self.schedule.at(self.step);
+        let ticket = self.gpu.submit("step", |rec| {
+            self.renderer.draws.fill(rec, self.step, TRAINING);
+            self.renderer
+                .rays
+                .draw(rec, &self.views, &self.renderer.draws);
+            self.gradients(rec, &now);
+            self.optimizer
+                .update(rec, &self.model.params, &now, &self.loss.bad_step);
+            let width = TERMS.len() as u64 + 1;
+            rec.copy(
+                &self.loss.sums,
+                0,
+                &self.history,
+                self.step % LOSS_HISTORY * width,
+                width,
+            );
+            Ok(())
+        })?;
+        self.tickets.push_back((self.step, ticket));
+        if self.tickets.len() as u64 > LOSS_HISTORY {
+            self.tickets.pop_front();
+        }
+        self.step += 1;
+        Ok(())
+    }
+
+    /// Losses of the batch of rays and draws that lie in the renderer's buffers, and the gradients of all parameters.
+    pub fn gradients(&self, rec: &mut Recorder, now: &Now) {
+        let (model, render, loss) = (&self.model, &self.renderer, &self.loss);
+        let annealed = annealed(now);
+        let look = render.look(annealed.inv_s_lower);
+        let n_samples = self.config.rays * self.config.sampling.samples;
+
+        // Forward: put samples where the surface is likely, ask the fields, composite.
+        model.params.normalise_weights(rec);
+        render.forward(rec, model, annealed, true);
+        // Loss: its value for the log, its gradient for everything below; a few more points are asked behind the heaviest samples.
+        loss.color(rec, &render.composite, &look);
+        if now.bias_weight > 0.0 {
+            loss.bias(
+                rec,
+                model,
+                &render.composite,
+                &look,
+                &self.scratch,
+                now.bias_weight as f32,
+            );
+        }
+        // Backward: the same sentence, right to left.
+        render
+            .composite
+            .backward(rec, &look, &model.surface, &loss.d_color);
+        let background_rays = render.background_rays(true);
+        model.background.backward(
+            rec,
+            &model.params,
+            &render.background,
+            &self.scratch,
+            &background_rays,
+        );
+        let eikonal_scale = self.config.loss.eikonal as f32 / n_samples as f32;
+        let shade_inputs = render.shade_inputs();
+        model.surface.backward(
+            rec,
+            &model.params,
+            &render.surface,
+            &self.scratch,
+            &shade_inputs,
+            eikonal_scale,
+        );
+        let interlevel_scale = self.config.loss.interlevel as f32 / self.config.rays as f32;
+        render.sampler.backward(
+            rec,
+            model,
+            &render.rays,
+            &render.composite.weights,
+            &self.scratch,
+            interlevel_scale,
+        );
+        model.params.fold_gradients(rec);
+        loss.sum(rec);
+    }
+
+    /// Steps done so far.
+    pub fn steps_done(&self) -> u64 {
+        self.step
+    }
+
+    /// Losses of the newest finished step, without waiting for the device; `None` before the first.
+    pub fn losses(&self) -> Result<Option<StepLosses>> {
+        for &(step, ticket) in self.tickets.iter().rev() {
+            if self.gpu.is_done(ticket)? {
+                return Ok(Some(self.losses_of(step)));
+            }
+        }
+        Ok(None)
+    }
+
+    /// Waits for all steps, then the losses of the last.
+    pub fn finish(&self) -> Result<Option<StepLosses>> {
+        self.gpu.finish()?;
+        Ok(self.tickets.back().map(|&(step, _)| self.losses_of(step)))
+    }
+
+    fn losses_of(&self, step: u64) -> StepLosses {
+        let width = TERMS.len() as u64 + 1;
+        let first = step % LOSS_HISTORY * width;
+        let mut values = [0.0; TERMS.len() + 1];
+        values.copy_from_slice(&self.history.read(first..first + width));
+        StepLosses { step, values }
+    }
+
+    /// Renders view `view` of the scene at its picture's size, at the current step.
+    pub fn render(
+        &self,
+        scene: &Scene,
+        view: usize,
+        size: (u32, u32),
+        keep_going: &mut dyn FnMut(f64) -> bool,
+    ) -> Result<Rendered> {
+        let row = self
+            .view_order
+            .iter()
+            .position(|&v| v == view)
+            .expect("a view of the scene that this was built from") as u32;
+        let n_training = self.views.n_training();
+        let appearance = match self.config.appearance.at_eval {
+            AppearanceAtEval::Frame if row < n_training => row,
+            _ => n_training,
+        };
+        let _ = scene;
+        let now = annealed(&self.schedule.at(self.step));
+        self.renderer.view(
+            &self.gpu,
+            &self.model,
+            &self.views,
+            row,
+            size,
+            appearance,
+            now,
+            keep_going,
+        )
+    }
+
+    pub fn model(&self) -> &Model {
+        &self.model
+    }
+    pub fn renderer(&self) -> &Renderer {
+        &self.renderer
+    }
+    pub fn region(&self) -> &Region {
+        &self.region
+    }
+    pub fn config(&self) -> &Config {
+        &self.config
+    }
+}
+
+fn annealed(now: &Now) -> Annealed {
+    Annealed {
+        anneal: now.anneal as f32,
+        inv_s_lower: now.inv_s_lower as f32,
+    }
+}

@@ -1,0 +1,83 @@
+#version 460
+#include "lib/prelude.glsl"
+#include "lib/sampling.glsl"
+#include "lib/volume.glsl"
+// Adjoint of composite_forward's colour, one invocation per ray; every gradient is overwritten.
+//     g_i = d_color . (1.002 rgb_i - 0.001),  g_end = d_color . background                  what one unit of weight is worth
+//     R_end = g_end,  R_i = (1 - e^-tau_i) g_i + e^-tau_i R_{i+1}                           what a ray is worth from sample i on
+//     d_tau_i = T_{i+1} (g_i - R_{i+1}),  d_rgb_i = 1.002 w_i d_color,  d_background = T_end d_color
+// and through tau = sigma(sdf, inv_s(logit)) length. The recursion from the back has no sums of large terms to cancel.
+layout(push_constant, scalar) uniform Args {
+    F32s sdf;             // [n * n_samples] at bin starts
+    F32s logit;           // [n * n_samples] of the local scale
+    F32s edges;           // [n, n_samples + 1]
+    F32s near_far;        // [2, n]
+    U32s ray_outside;     // [n]
+    F32s rgb;             // [3, n * n_samples] in [0,1]
+    F32s background;      // [3, n]
+    F32s d_color;         // [3, n]
+    F32sMut d_sdf;        // [n * n_samples]
+    F32sMut d_logit;      // [n * n_samples]; zero where the lower bound of 1/beta acts
+    F32sMut d_rgb;        // [3, n * n_samples] with respect to the colour before padding
+    F32sMut d_background; // [3, n]
+    uint n;
+    uint n_samples;
+    float scale_range;
+    float scale_floor;
+    float inv_s_lower;
+    uint outside_empty;
+};
+
+void main() {
+    uint ray = item();
+    if (ray >= n) return;
+    uint count = n * n_samples;
+    uint row = ray * n_samples;
+    Span span = ray_span(near_far, n, ray);
+    bool empty = outside_empty != 0u && ray_outside.at[ray] != 0u;
+
+    // Forward: the transmittance after each sample, left in d_sdf until the way back overwrites it.
+    float tau_sum = 0.0, transmittance = 1.0;
+    float s0 = edges.at[row + ray];
+    for (uint i = 0u; i < n_samples; i++) {
+        uint p = row + i;
+        float s1 = edges.at[p + ray + 1u];
+        float inv_s = local_scale(logit.at[p], scale_range, scale_floor, inv_s_lower).inv_s;
+        tau_sum += laplace_density(empty ? EMPTY_SDF : sdf.at[p], inv_s).sigma * bin_length(span, s0, s1);
+        transmittance = exp(-tau_sum);
+        d_sdf.at[p] = transmittance;
+        s0 = s1;
+    }
+
+    vec3 d_pixel = vec3(d_color.at[ray], d_color.at[n + ray], d_color.at[2u * n + ray]);
+    vec3 behind = vec3(background.at[ray], background.at[n + ray], background.at[2u * n + ray]);
+    [[unroll]] for (uint channel = 0u; channel < 3u; channel++)
+        d_background.at[channel * n + ray] = transmittance * d_pixel[channel];
+
+    // Backward.
+    float rest = dot(d_pixel, behind); // R_{i+1}
+    float s1 = s0;
+    for (uint k = 0u; k < n_samples; k++) {
+        uint i = n_samples - 1u - k;
+        uint p = row + i;
+        s0 = edges.at[p + ray];
+        float bin = bin_length(span, s0, s1);
+        LocalScale scale = local_scale(logit.at[p], scale_range, scale_floor, inv_s_lower);
+        Density density = laplace_density(empty ? EMPTY_SDF : sdf.at[p], scale.inv_s);
+        float alpha = opacity(density.sigma * bin);
+        float after = d_sdf.at[p];
+        float before = 1.0;
+        if (i > 0u) before = d_sdf.at[p - 1u];
+
+        float worth = 0.0;
+        [[unroll]] for (uint channel = 0u; channel < 3u; channel++) {
+            worth += d_pixel[channel] * padded_rgb(rgb.at[channel * count + p]);
+            d_rgb.at[channel * count + p] = (1.0 + 2.0 * RGB_PADDING) * alpha * before * d_pixel[channel];
+        }
+        float d_sigma = after * (worth - rest) * bin;
+        d_sdf.at[p] = d_sigma * density.d_sdf;
+        d_logit.at[p] = d_sigma * density.d_inv_s * scale.d_logit;
+        rest += alpha * (worth - rest);
+        s1 = s0;
+    }
+}

@@ -1,0 +1,47 @@
+#version 460
+#include "lib/prelude.glsl"
+#include "lib/rays.glsl"
+// Training rays: one invocation turns three uniform numbers into a pixel drawn uniformly over all pictures, its ray and its colour.
+//     view = first v with cumulative_share_v > u_0,  column = floor(u_1 width),  row = floor(u_2 height)
+layout(push_constant, scalar) uniform Args {
+    Views views;           // [n_views]
+    F32s cumulative_share; // [n_views] pixels of views 0..=v over those of all views; the last is 1
+    F32s pixel_draws;      // [3, n] in [0,1): picture, column, row
+    F32sMut origins;       // [3, n] region frame
+    F32sMut directions;    // [3, n] unit length
+    F32sMut near_far;      // [2, n]
+    U32sMut ray_view;      // [n] index into views
+    U32sMut ray_outside;   // [n] 1 where the ray misses the region
+    F32sMut target;        // [4, n] red, green, blue in [0,1], and weight 0 or 1
+    uint n;
+    uint n_views;
+    uint use_mask;     // 0: every pixel counts
+    uint region_shape; // 0: unit sphere, 1: box
+    vec3 half_extents; // of the box
+};
+
+void main() {
+    uint index = item();
+    if (index >= n) return;
+    float u = pixel_draws.at[index];
+    uint below = 0u, above = n_views - 1u;
+    while (below < above) {
+        uint middle = (below + above) / 2u;
+        if (cumulative_share.at[middle] > u) above = middle;
+        else below = middle + 1u;
+    }
+    View view = views.at[below];
+    uvec2 pixel = uvec2(vec2(pixel_draws.at[n + index], pixel_draws.at[2u * n + index]) * vec2(view.width, view.height));
+    pixel = min(pixel, uvec2(view.width, view.height) - 1u); // the product may round up to the size
+    Ray ray = pixel_ray(view, pixel, region_shape, half_extents);
+    vec4 wanted = pixel_target(view, pixel, use_mask);
+    [[unroll]] for (uint axis = 0u; axis < 3u; axis++) {
+        origins.at[axis * n + index] = ray.origin[axis];
+        directions.at[axis * n + index] = ray.direction[axis];
+    }
+    near_far.at[index] = ray.near;
+    near_far.at[n + index] = ray.far;
+    ray_view.at[index] = below;
+    ray_outside.at[index] = ray.outside;
+    [[unroll]] for (uint channel = 0u; channel < 4u; channel++) target.at[channel * n + index] = wanted[channel];
+}

@@ -1,0 +1,62 @@
+#version 460
+// Hash grid, hidden layer and first output of a field in one pass, one point per invocation:
+//   z = [x, e(x)],  u = W₁z + b₁,  h = σ(u),  out = w₂·h + b₂.
+// The SDF and its taps, the proposal densities and the background density are all this kernel (METHOD 2.3, 2.4, 2.8).
+#include "lib/prelude.glsl"
+#include "lib/hash_grid.glsl"
+#include "lib/field.glsl"
+
+layout(push_constant, scalar) uniform Args {
+    Levels levels;
+    F32s table;          // [entries, FEATURES]
+    F32s hidden_weight;  // [HIDDEN, INPUTS]
+    F32s hidden_bias;    // [HIDDEN]
+    F32s head_weight;    // [HIDDEN]
+    F32s head_bias;      // [1]
+    F32s points;         // [3, n] region frame
+    F32sMut inputs;      // [INPUTS, n] z, kept for the backward pass
+    F32sMut hidden;      // [HIDDEN, n_hidden] h of the first n_hidden points, for further heads
+    F32sMut first;       // [n] out
+    uint n;
+    uint n_hidden;
+};
+
+void main() {
+    uint point = item();
+    if (point >= n) return;
+    vec3 x = vec3(points.at[point], points.at[n + point], points.at[2u * n + point]);
+    if (COORDINATES != 0u) {
+        inputs.at[point] = x.x;
+        inputs.at[n + point] = x.y;
+        inputs.at[2u * n + point] = x.z;
+    }
+    for (uint l = 0u; l < LEVELS; ++l) {
+        Level level = levels.at[l];
+        Cell cell = cell_of(level, x);
+        float feature[FEATURES];
+        [[unroll]] for (uint f = 0u; f < FEATURES; ++f) feature[f] = 0.0;
+        [[unroll]] for (uint corner = 0u; corner < 8u; ++corner) {
+            uint entry = corner_entry(level, cell, corner) * FEATURES;
+            float weight = corner_weight(cell, corner);
+            [[unroll]] for (uint f = 0u; f < FEATURES; ++f) feature[f] = fma(weight, table.at[entry + f], feature[f]);
+        }
+        [[unroll]] for (uint f = 0u; f < FEATURES; ++f) inputs.at[(COORDINATES + l * FEATURES + f) * n + point] = feature[f];
+    }
+    float z[INPUTS];
+    [[unroll]] for (uint i = 0u; i < INPUTS; ++i) z[i] = inputs.at[i * n + point];
+
+    float sum = BIAS != 0u ? head_bias.at[0] : 0.0;
+    for (uint first_neuron = 0u; first_neuron < HIDDEN; first_neuron += TILE) {
+        float u[TILE];
+        [[unroll]] for (uint t = 0u; t < TILE; ++t) u[t] = BIAS != 0u ? hidden_bias.at[first_neuron + t] : 0.0;
+        [[unroll]] for (uint i = 0u; i < INPUTS; ++i) {
+            [[unroll]] for (uint t = 0u; t < TILE; ++t) u[t] = fma(hidden_weight.at[(first_neuron + t) * INPUTS + i], z[i], u[t]);
+        }
+        [[unroll]] for (uint t = 0u; t < TILE; ++t) {
+            float h = activation(u[t]);
+            sum = fma(head_weight.at[first_neuron + t], h, sum);
+            if (point < n_hidden) hidden.at[(first_neuron + t) * n_hidden + point] = h;
+        }
+    }
+    first.at[point] = sum;
+}

@@ -1,0 +1,64 @@
+#version 460
+#include "lib/prelude.glsl"
+#include "lib/sampling.glsl"
+// The heaviest sample of every ray and the two points behind it where bias correction asks the surface network (NeuRodin, section 3.4):
+//     k = argmax_i w_i (the first of equals),  P = o + (t_k + t_{k+1})/2 d,  queries P + eps d and P + offset d
+//     gate = [min_i sdf_i < 0] and, where need_opaque, [sum_i w_i > 0.999]; closed on rays outside the region
+// One subgroup per ray, its lanes share the samples; any subgroup size and any number of groups is right, rays are strided over.
+layout(push_constant, scalar) uniform Args {
+    F32s weights;       // [n, n_samples]
+    F32s sdf;           // [n * n_samples] at bin starts
+    F32s edges;         // [n, n_samples + 1]
+    F32s near_far;      // [2, n]
+    U32s ray_outside;   // [n]
+    F32s origins;       // [3, n]
+    F32s directions;    // [3, n]
+    F32sMut queries;    // [3, 2 n]: P + eps d, then P + offset d
+    F32sMut gate;       // [n] 0 or 1
+    U32sMut heaviest;   // [n] k
+    uint n;
+    uint n_samples;
+    float eps;          // region units
+    float offset;       // region units
+    uint need_opaque;   // 1: with a background the ray must be opaque
+};
+
+const float OPAQUE = 0.999;
+
+void main() {
+    uint group = gl_WorkGroupID.y * 256u + gl_WorkGroupID.x;
+    uint n_groups = gl_NumWorkGroups.x * gl_NumWorkGroups.y;
+    uint lane = gl_SubgroupInvocationID;
+    for (uint ray = group * gl_NumSubgroups + gl_SubgroupID; ray < n; ray += n_groups * gl_NumSubgroups) {
+        uint row = ray * n_samples;
+        float best = -1.0, lowest = 1e30, sum = 0.0;
+        uint best_index = n_samples - 1u;
+        for (uint i = lane; i < n_samples; i += gl_SubgroupSize) {
+            float weight = weights.at[row + i];
+            if (weight > best) {
+                best = weight;
+                best_index = i;
+            }
+            lowest = min(lowest, sdf.at[row + i]);
+            sum += weight;
+        }
+        float heaviest_weight = subgroupMax(best);
+        uint k = subgroupMin(best == heaviest_weight ? best_index : n_samples - 1u);
+        lowest = subgroupMin(lowest);
+        sum = subgroupAdd(sum);
+
+        if (subgroupElect()) {
+            bool open = lowest < 0.0 && ray_outside.at[ray] == 0u && (need_opaque == 0u || sum > OPAQUE);
+            gate.at[ray] = open ? 1.0 : 0.0;
+            heaviest.at[ray] = k;
+            uint edge = row + ray + k;
+            float t = bin_midpoint(ray_span(near_far, n, ray), edges.at[edge], edges.at[edge + 1u]);
+            [[unroll]] for (uint axis = 0u; axis < 3u; axis++) {
+                float d = directions.at[axis * n + ray];
+                float middle = origins.at[axis * n + ray] + t * d;
+                queries.at[axis * 2u * n + ray] = middle + eps * d;
+                queries.at[axis * 2u * n + n + ray] = middle + offset * d;
+            }
+        }
+    }
+}

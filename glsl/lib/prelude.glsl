@@ -1,0 +1,52 @@
+// What every kernel begins with: extensions, workgroup size, pointer types, the item that this invocation works on.
+//
+// A kernel's first line is `#version 460`, its second includes this file; `#define LOCAL_SIZE n` between the two changes the workgroup
+// size. Files are included once, however often they are named, so they need no guards.
+
+#extension GL_EXT_buffer_reference2 : require
+#extension GL_EXT_buffer_reference_uvec2 : require
+#extension GL_EXT_scalar_block_layout : require
+#extension GL_EXT_shader_explicit_arithmetic_types_int64 : require
+#extension GL_EXT_control_flow_attributes : require
+#extension GL_KHR_shader_subgroup_basic : require
+#extension GL_KHR_shader_subgroup_vote : require
+#extension GL_KHR_shader_subgroup_arithmetic : require
+#extension GL_KHR_shader_subgroup_ballot : require
+#extension GL_KHR_shader_subgroup_shuffle : require
+#extension GL_EXT_shader_atomic_float : require
+
+#ifndef LOCAL_SIZE
+#define LOCAL_SIZE 64
+#endif
+layout(local_size_x = LOCAL_SIZE) in;
+
+// Device pointers. `Mut` may be written; what is only read says so, since the recorder derives its barriers from it.
+layout(buffer_reference, scalar, buffer_reference_align = 4) readonly buffer F32s { float at[]; };
+layout(buffer_reference, scalar, buffer_reference_align = 4) buffer F32sMut { float at[]; };
+layout(buffer_reference, scalar, buffer_reference_align = 4) readonly buffer U32s { uint at[]; };
+layout(buffer_reference, scalar, buffer_reference_align = 4) buffer U32sMut { uint at[]; };
+
+// Index of this invocation among the launch's items, in rows of 256 workgroups: one dimension of a grid ends at 65535 workgroups.
+// The last row is ragged, so a kernel leaves its body where item() >= n.
+uint item() { return (gl_WorkGroupID.y * 256u + gl_WorkGroupID.x) * gl_WorkGroupSize.x + gl_LocalInvocationID.x; }
+
+// Index of this invocation's workgroup among them; for kernels that give a workgroup (or a subgroup) one piece of work.
+uint group() { return gl_WorkGroupID.y * 256u + gl_WorkGroupID.x; }
+
+// The launch's second dimension (Work::slices): level, layer, axis.
+uint slice() { return gl_WorkGroupID.z; }
+
+// Adds to a float that other invocations add to as well. Without the extension: compare and swap until nobody came between.
+void add(F32sMut p, uint i, float v) {
+#ifdef NO_FLOAT_ATOMICS
+    U32sMut bits = U32sMut(uvec2(p));
+    uint seen = bits.at[i];
+    uint expected;
+    do {
+        expected = seen;
+        seen = atomicCompSwap(bits.at[i], expected, floatBitsToUint(uintBitsToFloat(expected) + v));
+    } while (seen != expected);
+#else
+    atomicAdd(p.at[i], v);
+#endif
+}

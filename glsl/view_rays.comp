@@ -1,0 +1,43 @@
+#version 460
+#include "lib/prelude.glsl"
+#include "lib/rays.glsl"
+// The rays of pixels first, first + 1, ... of one view, row by row, one per invocation: what rendering a picture needs.
+// Indices past the last pixel repeat the last pixel.
+layout(push_constant, scalar) uniform Args {
+    Views views;
+    F32sMut origins;     // [3, n] region frame
+    F32sMut directions;  // [3, n] unit length
+    F32sMut near_far;    // [2, n]
+    U32sMut ray_view;    // [n] all set to appearance_view
+    U32sMut ray_outside; // [n] 1 where the ray misses the region
+    F32sMut target;      // [4, n] red, green, blue, weight; untouched where with_target is 0
+    uint n;
+    uint view;            // entry of views
+    uint first;           // pixel
+    uint appearance_view; // the training view whose appearance code colours these rays
+    uint with_target;     // 0: the view has no pixels, or nobody asks for them
+    uint use_mask;        // 0: every pixel counts
+    uint region_shape;    // 0: unit sphere, 1: box
+    vec3 half_extents;    // of the box
+};
+
+void main() {
+    uint index = item();
+    if (index >= n) return;
+    View camera = views.at[view];
+    uint number = min(first + index, camera.width * camera.height - 1u);
+    uvec2 pixel = uvec2(number % camera.width, number / camera.width);
+    Ray ray = pixel_ray(camera, pixel, region_shape, half_extents);
+    [[unroll]] for (uint axis = 0u; axis < 3u; axis++) {
+        origins.at[axis * n + index] = ray.origin[axis];
+        directions.at[axis * n + index] = ray.direction[axis];
+    }
+    near_far.at[index] = ray.near;
+    near_far.at[n + index] = ray.far;
+    ray_view.at[index] = appearance_view;
+    ray_outside.at[index] = ray.outside;
+    if (with_target != 0u) {
+        vec4 wanted = pixel_target(camera, pixel, use_mask);
+        [[unroll]] for (uint channel = 0u; channel < 4u; channel++) target.at[channel * n + index] = wanted[channel];
+    }
+}

@@ -1,0 +1,34 @@
+#version 460
+// Adjoint of weight_norm_forward, one row per invocation: with s = d_W·v/‖v‖,
+//   d_g += s,  d_v += g/‖v‖ (d_W − s v/‖v‖).  d_W is consumed: zeroed for the next step.
+#include "lib/prelude.glsl"
+#include "lib/weight_rows.glsl"
+
+layout(push_constant, scalar) uniform Args {
+    WeightRows rows;     // [n]
+    F32s params;
+    F32sMut d_weights;   // consumed
+    F32sMut d_params;    // accumulated
+    uint n;
+};
+
+void main() {
+    uint r = item();
+    if (r >= n) return;
+    WeightRow row = rows.at[r];
+    float square = 0.0;
+    float along = 0.0;
+    for (uint i = 0u; i < row.columns; ++i) {
+        float v = params.at[row.v + i];
+        square = fma(v, v, square);
+        along = fma(v, d_weights.at[row.weight + i], along);
+    }
+    float inverse = inversesqrt(square);
+    along *= inverse;
+    d_params.at[row.g] += along;
+    float scale = params.at[row.g] * inverse;
+    for (uint i = 0u; i < row.columns; ++i) {
+        d_params.at[row.v + i] += scale * (d_weights.at[row.weight + i] - along * inverse * params.at[row.v + i]);
+        d_weights.at[row.weight + i] = 0.0;
+    }
+}

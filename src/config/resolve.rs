@@ -1,0 +1,502 @@
+//! From what was asked for to a `Config`: presets, configuration files, single assignments; and back to readable TOML.
+//!
+//! Precedence, weakest first: `outdoor-large.toml` (complete), the preset's differences, a file, assignments. Each is laid over the
+//! one before it key by key, so that every complaint can name its key and, where there is none of that name, the nearest that exists.
+
+use super::Config;
+use crate::{Error, Result};
+use toml::{Table, Value};
+
+/// A named set of differences from the complete configuration.
+#[derive(Clone, Copy, Debug)]
+pub struct Preset {
+    pub name: &'static str,
+    /// What it is for, in one line.
+    pub summary: &'static str,
+    toml: &'static str,
+}
+
+/// Every preset, the default one first.
+pub const PRESETS: &[Preset] = &[
+    Preset {
+        name: "outdoor-large",
+        summary: "NeuRodin stage 1, large outdoor scenes: a GPU, hours",
+        toml: COMPLETE,
+    },
+    Preset {
+        name: "indoor-large",
+        summary: "NeuRodin stage 1, halls and large interiors: a GPU, hours",
+        toml: include_str!("presets/indoor-large.toml"),
+    },
+    Preset {
+        name: "indoor-small",
+        summary: "NeuRodin stage 1, single rooms: a GPU, hours",
+        toml: include_str!("presets/indoor-small.toml"),
+    },
+    Preset {
+        name: "outdoor-tiny",
+        summary: "objects and outdoor scenes on a software device: minutes",
+        toml: include_str!("presets/outdoor-tiny.toml"),
+    },
+    Preset {
+        name: "indoor-tiny",
+        summary: "rooms on a software device: minutes",
+        toml: include_str!("presets/indoor-tiny.toml"),
+    },
+];
+
+/// The complete, commented configuration; also the template of [`Config::to_toml`].
+const COMPLETE: &str = include_str!("presets/outdoor-large.toml");
+
+impl Default for Config {
+    fn default() -> Self {
+        toml::from_str(COMPLETE).expect("outdoor-large.toml is complete and well-formed")
+    }
+}
+
+impl Config {
+    /// The configuration of a preset.
+    ///
+    /// # Errors
+    /// [`Error::Config`] for an unknown name, with the nearest one.
+    pub fn preset(name: &str) -> Result<Config> {
+        let Some(preset) = PRESETS.iter().find(|preset| preset.name == name) else {
+            let hint = match nearest(name, PRESETS.iter().map(|preset| preset.name)) {
+                Some(near) => format!("did you mean '{near}'? "),
+                None => String::new(),
+            };
+            let all: Vec<_> = PRESETS.iter().map(|preset| preset.name).collect();
+            return Err(Error::Config {
+                what: format!(
+                    "unknown preset '{name}'; {hint}there are: {}",
+                    all.join(", ")
+                ),
+            });
+        };
+        let complete = Table::try_from(Config::default()).expect("a configuration is a table");
+        let table = parse(preset.toml, preset.name)?;
+        overlay(complete, &table, &format!("preset {name}"))
+    }
+
+    /// The configuration in a TOML text, which may be partial: its key `preset` (default: outdoor-large) says what it differs from.
+    /// `source` names the text in error messages.
+    ///
+    /// # Errors
+    /// [`Error::Config`] for text that is not TOML, unknown keys and presets, and values of the wrong type or out of range.
+    pub fn from_toml(text: &str, source: &str) -> Result<Config> {
+        Config::default_preset_of(text, source)?
+            .with_toml(text, source)?
+            .validated()
+    }
+
+    /// The preset that a TOML text starts from.
+    fn default_preset_of(text: &str, source: &str) -> Result<Config> {
+        match parse(text, source)?.get("preset") {
+            None => Ok(Config::default()),
+            Some(Value::String(name)) => Config::preset(name),
+            Some(other) => Err(Error::Config {
+                what: format!(
+                    "{source}: preset = {other}: expected the name of a preset in quotes"
+                ),
+            }),
+        }
+    }
+
+    /// This configuration with a partial TOML text laid over it; ranges are not checked yet.
+    ///
+    /// # Errors
+    /// As [`Config::from_toml`].
+    pub fn with_toml(self, text: &str, source: &str) -> Result<Config> {
+        let table = Table::try_from(self).expect("a configuration is a table");
+        overlay(table, &parse(text, source)?, source)
+    }
+
+    /// This configuration with one assignment `group.key=value` made; ranges are not checked yet. Values are written as in TOML,
+    /// names without quotes, lists with or without brackets.
+    ///
+    /// # Errors
+    /// [`Error::Config`] naming key, value and expected type, or the nearest existing key.
+    pub fn with_assignment(self, assignment: &str) -> Result<Config> {
+        let Some((key, text)) = assignment.split_once('=') else {
+            return Err(Error::Config {
+                what: format!(
+                    "'{assignment}' is no assignment; write key=value, for example hash.log2_size=19"
+                ),
+            });
+        };
+        let (key, text) = (key.trim(), text.trim());
+        if key == "preset" {
+            return Err(Error::Config {
+                what: format!("the preset is not a setting among others; use --preset {text}"),
+            });
+        }
+        let mut table = Table::try_from(self).expect("a configuration is a table");
+        let path: Vec<&str> = key.split('.').collect();
+        let slot = slot(&mut table, &path).map_err(|why| Error::Config { what: why })?;
+        let expected = type_of(slot);
+        *slot = read_as(slot, text).ok_or_else(|| Error::Config {
+            what: format!("{key}={text}: expected {expected}"),
+        })?;
+        check(table, key, text)
+    }
+
+    /// Every setting as TOML, each with the comment that explains it. [`Config::from_toml`] reads it back to an equal configuration.
+    pub fn to_toml(&self) -> String {
+        let table = Table::try_from(self).expect("a configuration is a table");
+        let mut text = String::new();
+        let mut group: Vec<&str> = Vec::new();
+        for line in COMPLETE.lines() {
+            if let Some(header) = line.strip_prefix('[') {
+                group = header.split(']').next().unwrap_or("").split('.').collect();
+            } else if let Some((key, rest)) = line.split_once(" = ") {
+                let value = group
+                    .iter()
+                    .try_fold(&table, |table, name| table.get(*name)?.as_table())
+                    .and_then(|table| table.get(key))
+                    .expect("outdoor-large.toml holds the keys of a configuration");
+                let setting = format!("{key} = {value}");
+                text += &match rest.split_once('#') {
+                    Some((_, comment)) => format!("{setting:<28} #{comment}\n"),
+                    None => setting + "\n",
+                };
+                continue;
+            }
+            text += line;
+            text.push('\n');
+        }
+        text
+    }
+}
+
+/// The table of a TOML text.
+fn parse(text: &str, source: &str) -> Result<Table> {
+    text.parse::<Table>().map_err(|error| Error::Config {
+        what: format!("{source}: {error}"),
+    })
+}
+
+/// Lays `over` onto the complete table, leaf by leaf.
+fn overlay(mut complete: Table, over: &Table, source: &str) -> Result<Config> {
+    let mut leaves = Vec::new();
+    collect_leaves(over, &mut Vec::new(), &mut leaves);
+    for (path, value) in &leaves {
+        let names: Vec<&str> = path.iter().map(String::as_str).collect();
+        let key = names.join(".");
+        let in_source = |what: String| Error::Config {
+            what: format!("{source}: {what}"),
+        };
+        let slot = slot(&mut complete, &names).map_err(in_source)?;
+        *slot = match (&*slot, value) {
+            (Value::Float(_), Value::Integer(whole)) => Value::Float(*whole as f64),
+            (old, new) if old.same_type(new) => new.clone(),
+            (old, new) => {
+                let expected = type_of(old);
+                return Err(in_source(format!("{key} = {new}: expected {expected}")));
+            }
+        };
+        check(complete.clone(), &key, &value.to_string())
+            .map_err(|error| in_source(error.to_string()))?;
+    }
+    complete
+        .try_into()
+        .map_err(|error: toml::de::Error| Error::Config {
+            what: format!("{source}: {}", error.message()),
+        })
+}
+
+fn collect_leaves(table: &Table, path: &mut Vec<String>, leaves: &mut Vec<(Vec<String>, Value)>) {
+    for (name, value) in table {
+        path.push(name.clone());
+        match value {
+            Value::Table(inner) => collect_leaves(inner, path, leaves),
+            leaf => leaves.push((path.clone(), leaf.clone())),
+        }
+        path.pop();
+    }
+}
+
+/// The setting at a path, or why there is none.
+fn slot<'t>(table: &'t mut Table, path: &[&str]) -> Result<&'t mut Value, String> {
+    let key = path.join(".");
+    let mut leaves = Vec::new();
+    collect_leaves(table, &mut Vec::new(), &mut leaves);
+    let keys: Vec<String> = leaves.into_iter().map(|(path, _)| path.join(".")).collect();
+    if !keys.contains(&key) {
+        let inside: Vec<&str> = keys
+            .iter()
+            .filter(|existing| existing.starts_with(&format!("{key}.")))
+            .map(String::as_str)
+            .collect();
+        if !inside.is_empty() {
+            return Err(format!(
+                "'{key}' is a group of settings: {}",
+                inside.join(", ")
+            ));
+        }
+        return Err(match nearest(&key, keys.iter().map(String::as_str)) {
+            Some(near) => format!("unknown key '{key}'; did you mean '{near}'?"),
+            None => format!("unknown key '{key}'; `neurodin train --print-config` lists every key"),
+        });
+    }
+    let (last, groups) = path.split_last().expect("a key has at least one name");
+    let group = groups.iter().fold(table, |table, name| {
+        table[*name]
+            .as_table_mut()
+            .expect("the path leads through groups")
+    });
+    Ok(&mut group[*last])
+}
+
+/// The name most like `name`, if any is like it at all: by the whole path, or by its last part alone.
+fn nearest<'n>(name: &str, names: impl Iterator<Item = &'n str>) -> Option<&'n str> {
+    let last = |path: &str| path.rsplit('.').next().unwrap_or(path).to_string();
+    names
+        .map(|existing| {
+            let whole = strsim::jaro_winkler(name, existing);
+            let part = strsim::jaro_winkler(&last(name), &last(existing));
+            // The group decides between equal last parts.
+            (existing, whole.max(0.9 * part + 0.1 * whole))
+        })
+        .filter(|(_, likeness)| *likeness > 0.7)
+        .max_by(|a, b| a.1.total_cmp(&b.1))
+        .map(|(existing, _)| existing)
+}
+
+/// A value's type, for a person.
+fn type_of(value: &Value) -> String {
+    match value {
+        Value::String(_) => "a name".into(),
+        Value::Integer(_) => "a whole number".into(),
+        Value::Float(_) => "a number".into(),
+        Value::Boolean(_) => "true or false".into(),
+        Value::Array(list) => match list.first() {
+            Some(first) => format!("a list, each {}", type_of(first)),
+            None => "a list".into(),
+        },
+        Value::Datetime(_) | Value::Table(_) => "a group".into(),
+    }
+}
+
+/// Reads a command-line word as a value of the old value's type.
+fn read_as(old: &Value, text: &str) -> Option<Value> {
+    let digits = text.replace('_', "");
+    match old {
+        Value::String(_) => Some(Value::String(text.trim_matches(['"', '\'']).into())),
+        Value::Integer(_) => whole_number(&digits).map(Value::Integer),
+        Value::Float(_) => digits.parse().ok().map(Value::Float),
+        Value::Boolean(_) => text.parse().ok().map(Value::Boolean),
+        Value::Array(_) => {
+            let inner = text.trim_start_matches('[').trim_end_matches(']');
+            inner
+                .split(',')
+                .map(|item| whole_number(&item.trim().replace('_', "")).map(Value::Integer))
+                .collect::<Option<Vec<_>>>()
+                .map(Value::Array)
+        }
+        Value::Datetime(_) | Value::Table(_) => None,
+    }
+}
+
+/// "300000", or "3e5".
+fn whole_number(digits: &str) -> Option<i64> {
+    digits.parse().ok().or_else(|| {
+        let number: f64 = digits.parse().ok()?;
+        (number.fract() == 0.0 && number.abs() < 9e15).then_some(number as i64)
+    })
+}
+
+/// The table as a configuration, or the complaint about the one key that was just changed.
+fn check(table: Table, key: &str, value: &str) -> Result<Config> {
+    table
+        .try_into()
+        .map_err(|error: toml::de::Error| Error::Config {
+            what: format!("{key}={value}: {}", error.message()),
+        })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::{BackgroundKind, Effect, RegionKind};
+
+    fn complaint(result: Result<Config>) -> String {
+        let error = result.expect_err("a complaint");
+        assert!(matches!(error, Error::Config { .. }), "{error:?}");
+        error.to_string()
+    }
+
+    #[test]
+    fn presets_are_sound_and_survive_the_round_trip() {
+        for preset in PRESETS {
+            let config = Config::preset(preset.name).unwrap().validated().unwrap();
+            assert_eq!(config.preset, preset.name);
+            let text = config.to_toml();
+            assert!(text.contains("# of every random number"), "comments stay");
+            assert_eq!(Config::from_toml(&text, "text").unwrap(), config);
+        }
+    }
+
+    /// The numbers that distinguish the published configurations (METHOD 1.1).
+    #[test]
+    fn published_differences() {
+        let [outdoor, hall, room] = ["outdoor-large", "indoor-large", "indoor-small"]
+            .map(|name| Config::preset(name).unwrap());
+        assert_eq!([outdoor.rays, hall.rays, room.rays], [1024, 1024, 512]);
+        assert_eq!(
+            [
+                outdoor.hash.features,
+                hall.hash.features,
+                room.hash.features
+            ],
+            [8, 8, 2]
+        );
+        assert_eq!(
+            [&outdoor, &hall, &room].map(|config| config.surface.inside_out),
+            [false, true, true]
+        );
+        assert_eq!(
+            [&outdoor, &hall, &room].map(|config| config.background.kind),
+            [
+                BackgroundKind::Field,
+                BackgroundKind::None,
+                BackgroundKind::None
+            ]
+        );
+        assert_eq!(
+            [&outdoor, &hall, &room].map(|config| config.loss.bias.weight),
+            [0.1, 0.05, 0.05]
+        );
+        assert_eq!(
+            [&outdoor, &hall, &room].map(|config| config.loss.bias.offset),
+            [0.001, 0.001, 0.01]
+        );
+        assert_eq!(
+            [&outdoor, &hall, &room].map(|config| config.loss.bias.ramp_steps),
+            [0, 10_000, 10_000]
+        );
+    }
+
+    #[test]
+    fn unknown_names_are_answered_with_the_nearest() {
+        assert!(complaint(Config::preset("outdor-tiny")).contains("'outdoor-tiny'"));
+        let assign = |text: &str| complaint(Config::default().with_assignment(text));
+        for (text, near) in [
+            ("hash.log2size=22", "'hash.log2_size'"),
+            ("log2_size=22", "log2_size'"),
+            ("hash.log2_hashmap_size=22", "'hash.log2_size'"),
+            ("ray=12", "'rays'"),
+            ("loss.eikonal_weight=1", "'loss.eikonal'"),
+            (
+                "optimizer.field.learning_rate=1",
+                "'optimizer.fields.learning_rate'",
+            ),
+        ] {
+            let told = assign(text);
+            assert!(
+                told.contains(near) && told.contains(text.split('=').next().unwrap()),
+                "{told}"
+            );
+        }
+        let told = complaint(Config::from_toml("[hash]\nlevls = 3\n", "my.toml"));
+        assert!(
+            told.contains("my.toml") && told.contains("'hash.levels'"),
+            "{told}"
+        );
+        assert!(complaint(Config::from_toml("preset = 'x'", "my.toml")).contains("outdoor-large"));
+        assert!(
+            assign("hash=3").contains("hash.levels"),
+            "a group lists its keys"
+        );
+    }
+
+    #[test]
+    fn assignments_are_read_by_type() {
+        let config = Config::default()
+            .with_assignment("hash.log2_size=22")
+            .and_then(|config| config.with_assignment("steps = 3e3"))
+            .and_then(|config| config.with_assignment("loss.eikonal=1"))
+            .and_then(|config| config.with_assignment("scene.shape=box"))
+            .and_then(|config| config.with_assignment("surface.inside_out=true"))
+            .and_then(|config| config.with_assignment("sampling.proposal_samples=64,48"))
+            .unwrap();
+        assert_eq!(
+            (config.hash.log2_size, config.steps, config.loss.eikonal),
+            (22, 3000, 1.0)
+        );
+        assert_eq!(
+            (config.scene.shape, config.surface.inside_out),
+            (RegionKind::Box, true)
+        );
+        assert_eq!(config.sampling.proposal_samples, [64, 48]);
+        for (text, expected) in [
+            ("hash.log2_size=big", "a whole number"),
+            ("hash.levels=1.5", "a whole number"),
+            ("hash.levels=-1", "u32"),
+            ("loss.eikonal=much", "a number"),
+            ("surface.inside_out=yes", "true or false"),
+            ("scene.shape=cone", "`sphere`"),
+            ("sampling.proposal_samples=64", "array of length 2"),
+            ("hash.levels", "key=value"),
+            ("preset=indoor-tiny", "--preset"),
+        ] {
+            let told = complaint(Config::default().with_assignment(text));
+            let (key, value) = text.split_once('=').unwrap_or((text, ""));
+            assert!(told.contains(expected), "{text}: {told}");
+            assert!(
+                key == "preset" || told.contains(key) && told.contains(value),
+                "{text}: {told}"
+            );
+        }
+        let told = complaint(Config::from_toml("rays = 'many'", "my.toml"));
+        assert!(
+            told.contains("rays") && told.contains("whole number"),
+            "{told}"
+        );
+        assert!(complaint(Config::from_toml("rays = ", "my.toml")).contains("my.toml"));
+    }
+
+    #[test]
+    fn ranges_are_checked_together() {
+        let wrong = Config::default()
+            .with_toml(
+                "rays = 0\n[hash]\nfeatures = 3\nlevels = 17\nmax = 8",
+                "text",
+            )
+            .unwrap();
+        let told = complaint(wrong.validated());
+        for key in [
+            "rays = 0",
+            "hash.features = 3",
+            "hash.levels = 17",
+            "hash.max = 8",
+        ] {
+            assert!(told.contains(key), "{told}");
+        }
+        let not_a_number = Config::default()
+            .with_assignment("loss.eikonal=nan")
+            .unwrap();
+        assert!(complaint(not_a_number.validated()).contains("loss.eikonal"));
+    }
+
+    #[test]
+    fn differences_are_listed_with_their_effect() {
+        let was = Config::default();
+        let now = was
+            .clone()
+            .with_toml(
+                "steps = 10\n[hash]\nlog2_size = 22\n[report]\nkeep = 5",
+                "text",
+            )
+            .unwrap();
+        let effects: Vec<_> = was
+            .differences(&now)
+            .into_iter()
+            .map(|difference| (difference.to_string(), difference.effect))
+            .collect();
+        assert_eq!(effects.len(), 3, "{effects:?}");
+        assert!(effects.contains(&("hash.log2_size: 19 -> 22".into(), Effect::Incompatible)));
+        assert!(effects.contains(&("steps: 300000 -> 10".into(), Effect::Course)));
+        assert!(effects.contains(&("report.keep: 2 -> 5".into(), Effect::None)));
+        assert!(was.differences(&was).is_empty());
+    }
+}

@@ -1,0 +1,242 @@
+//! Kernels: pipelines built from the SPIR-V that build.rs embedded, one for each set of specialisation constants.
+
+use super::device::{Context, DeviceInfo, Gpu, vulkan};
+use crate::{Error, Result};
+use ash::vk;
+use bytemuck::Pod;
+use std::collections::HashMap;
+use std::marker::PhantomData;
+use std::sync::{Arc, Mutex};
+
+/// What build.rs found in a kernel's SPIR-V.
+#[derive(Debug)]
+pub struct KernelModule {
+    /// File stem; also the pipeline's debug name and the profiler's row.
+    pub name: &'static str,
+    pub local_size: [u32; 3],
+    /// SPIR-V 1.5, little-endian words.
+    pub spirv: &'static [u8],
+    /// The variant for devices without float atomics, where the kernel uses them.
+    pub spirv_without_float_atomics: Option<&'static [u8]>,
+    /// Whether it needs 64-bit integers.
+    pub int64: bool,
+    /// The pointers in the push-constant block.
+    pub pointers: &'static [PointerArg],
+    /// Whether it reads, or writes, through pointers found elsewhere than in the block.
+    pub indirect_reads: bool,
+    pub indirect_writes: bool,
+}
+
+/// A pointer in a push-constant block.
+#[derive(Debug)]
+pub struct PointerArg {
+    pub name: &'static str,
+    /// Byte offset in the block.
+    pub offset: usize,
+    /// Not declared `readonly`.
+    pub writable: bool,
+}
+
+/// A kernel's specialisation constants; implemented by every generated `kernels::<stem>::Shape`.
+pub trait KernelShape {
+    /// The push-constant block.
+    type Args: Pod;
+    fn module() -> &'static KernelModule;
+    /// (constant id, bits) of every constant.
+    fn constants(&self) -> Vec<(u32, u32)>;
+}
+
+/// A kernel, ready to run with arguments `A`. Cheap to clone.
+pub struct Kernel<A> {
+    pub(super) pipeline: vk::Pipeline,
+    pub(super) module: &'static KernelModule,
+    pub(super) row: Arc<str>,
+    /// Keeps the pipeline alive.
+    pub(super) gpu: Gpu,
+    args: PhantomData<fn(A)>,
+}
+
+impl<A> Clone for Kernel<A> {
+    fn clone(&self) -> Self {
+        Kernel {
+            pipeline: self.pipeline,
+            module: self.module,
+            row: self.row.clone(),
+            gpu: self.gpu.clone(),
+            args: PhantomData,
+        }
+    }
+}
+
+impl<A> std::fmt::Debug for Kernel<A> {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "Kernel({})", self.row)
+    }
+}
+
+impl<A> Kernel<A> {
+    /// The same kernel under its own profiler row, "<stem> <label>".
+    pub fn labelled(&self, label: &str) -> Kernel<A> {
+        Kernel {
+            row: format!("{} {label}", self.module.name).into(),
+            ..self.clone()
+        }
+    }
+
+    /// Name of its profiler row.
+    pub fn row(&self) -> &str {
+        &self.row
+    }
+
+    /// Invocations per workgroup.
+    pub fn local_size(&self) -> u32 {
+        self.module.local_size.iter().product()
+    }
+}
+
+/// A pipeline's identity: kernel and specialisation constants.
+type Key = (&'static str, Vec<(u32, u32)>);
+
+/// Pipelines by kernel and constants.
+pub(super) struct Pipelines {
+    pub(super) layout: vk::PipelineLayout,
+    built: Mutex<HashMap<Key, (vk::Pipeline, Arc<str>)>>,
+    device: ash::Device,
+}
+
+/// Bytes of push constants that the common pipeline layout has; build.rs holds every kernel to them.
+const PUSH_CONSTANT_BYTES: u32 = 128;
+
+impl Pipelines {
+    pub(super) fn new(context: &Context) -> Result<Pipelines> {
+        let ranges = [vk::PushConstantRange::default()
+            .stage_flags(vk::ShaderStageFlags::COMPUTE)
+            .size(PUSH_CONSTANT_BYTES)];
+        let create = vk::PipelineLayoutCreateInfo::default().push_constant_ranges(&ranges);
+        // SAFETY: a live device.
+        let layout = unsafe { context.device.create_pipeline_layout(&create, None) }
+            .map_err(vulkan("vkCreatePipelineLayout"))?;
+        Ok(Pipelines {
+            layout,
+            built: Mutex::new(HashMap::new()),
+            device: context.device.clone(),
+        })
+    }
+
+    fn build(
+        &self,
+        context: &Context,
+        info: &DeviceInfo,
+        module: &'static KernelModule,
+        constants: &[(u32, u32)],
+    ) -> Result<vk::Pipeline> {
+        let spirv = match module.spirv_without_float_atomics {
+            Some(fallback) if !info.float_atomics => fallback,
+            _ => module.spirv,
+        };
+        let words: Vec<u32> = bytemuck::pod_collect_to_vec(spirv);
+        let create = vk::ShaderModuleCreateInfo::default().code(&words);
+        // SAFETY: SPIR-V from glslang, of the version that the device's Vulkan 1.2 takes.
+        let shader = unsafe { self.device.create_shader_module(&create, None) }
+            .map_err(vulkan("vkCreateShaderModule"))?;
+
+        let entries: Vec<vk::SpecializationMapEntry> = constants
+            .iter()
+            .enumerate()
+            .map(|(i, &(id, _))| vk::SpecializationMapEntry {
+                constant_id: id,
+                offset: 4 * i as u32,
+                size: 4,
+            })
+            .collect();
+        let values: Vec<u32> = constants.iter().map(|&(_, bits)| bits).collect();
+        let specialization = vk::SpecializationInfo::default()
+            .map_entries(&entries)
+            .data(bytemuck::cast_slice(&values));
+        let invocations: u32 = module.local_size.iter().product();
+        let flags = match info.full_subgroups {
+            Some((_, largest)) if module.local_size[0].is_multiple_of(largest) => {
+                vk::PipelineShaderStageCreateFlags::ALLOW_VARYING_SUBGROUP_SIZE
+                    | vk::PipelineShaderStageCreateFlags::REQUIRE_FULL_SUBGROUPS
+            }
+            _ => vk::PipelineShaderStageCreateFlags::empty(),
+        };
+        let stage = vk::PipelineShaderStageCreateInfo::default()
+            .flags(flags)
+            .stage(vk::ShaderStageFlags::COMPUTE)
+            .module(shader)
+            .name(c"main")
+            .specialization_info(&specialization);
+        let create = [vk::ComputePipelineCreateInfo::default()
+            .flags(vk::PipelineCreateFlags::DISPATCH_BASE)
+            .stage(stage)
+            .layout(self.layout)];
+        let built = if invocations > info.max_workgroup {
+            Err(Error::NoDevice {
+                what: format!(
+                    "kernel {} has workgroups of {invocations}, {} ends at {}",
+                    module.name, info.name, info.max_workgroup
+                ),
+            })
+        } else {
+            // SAFETY: everything that `create` names outlives the call.
+            unsafe {
+                self.device
+                    .create_compute_pipelines(vk::PipelineCache::null(), &create, None)
+            }
+            .map_err(|(_, error)| vulkan("vkCreateComputePipelines")(error))
+        };
+        // SAFETY: pipelines do not need their shader module once they are made.
+        unsafe { self.device.destroy_shader_module(shader, None) };
+        let pipeline = built?[0];
+        context.name(pipeline, module.name);
+        Ok(pipeline)
+    }
+}
+
+impl Drop for Pipelines {
+    fn drop(&mut self) {
+        // SAFETY: the queue, dropped before, waited for all work.
+        unsafe {
+            for (pipeline, _) in self.built.lock().expect("no panic under the lock").values() {
+                self.device.destroy_pipeline(*pipeline, None);
+            }
+            self.device.destroy_pipeline_layout(self.layout, None);
+        }
+    }
+}
+
+impl Gpu {
+    /// The kernel with these specialisation constants, built at the first call.
+    pub fn kernel<S: KernelShape>(&self, shape: S) -> Result<Kernel<S::Args>> {
+        let module = S::module();
+        let info = &self.inner.info;
+        if module.int64 && !info.int64 {
+            return Err(Error::NoDevice {
+                what: format!(
+                    "kernel {} needs 64-bit integers, {} has none",
+                    module.name, info.name
+                ),
+            });
+        }
+        let pipelines = &self.inner.pipelines;
+        let key = (module.name, shape.constants());
+        let mut built = pipelines.built.lock().expect("no panic under the lock");
+        let (pipeline, row) = match built.get(&key) {
+            Some((pipeline, row)) => (*pipeline, row.clone()),
+            None => {
+                let pipeline = pipelines.build(&self.inner.context, info, module, &key.1)?;
+                let row: Arc<str> = module.name.into();
+                built.insert(key, (pipeline, row.clone()));
+                (pipeline, row)
+            }
+        };
+        Ok(Kernel {
+            pipeline,
+            module,
+            row,
+            gpu: self.clone(),
+            args: PhantomData,
+        })
+    }
+}

@@ -1,0 +1,189 @@
+//! One fully connected layer on planar activations `[channel, n]`: forward, gradient of the inputs, gradient of the weights.
+
+use super::params::{Params, WeightHandle};
+use crate::Result;
+use crate::gpu::{Gpu, Kernel, Ptr, PtrMut, Recorder, Work};
+use crate::kernels::{linear, weight_gradient};
+
+/// What follows the affine map.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Activation {
+    None = 0,
+    Relu = 1,
+    Sigmoid = 2,
+}
+
+/// A layer, or some of its output rows: Y = σ(WX + b).
+pub struct Layer {
+    inputs: u32,
+    outputs: u32,
+    /// Rows of the matrix that come before this layer's own (heads share one matrix).
+    first_row: u32,
+    handle: WeightHandle,
+    forward: Kernel<linear::Args>,
+    /// Adjoint with respect to the first `backward_inputs` inputs; none where nobody asks for them.
+    backward: Option<(u32, Kernel<linear::Args>)>,
+    gradient: Kernel<weight_gradient::Args>,
+}
+
+/// Shape of a [`Layer`].
+pub struct LayerShape {
+    pub inputs: u32,
+    pub outputs: u32,
+    pub first_row: u32,
+    pub activation: Activation,
+    /// How many of the leading inputs receive a gradient.
+    pub backward_inputs: u32,
+    /// The inputs came out of a ReLU, whose derivative gates their gradient.
+    pub inputs_are_relu: bool,
+}
+
+/// Samples that one workgroup of the weight gradient sums up.
+const GRADIENT_CHUNK: u32 = 2048;
+
+impl Layer {
+    /// Builds the layer's kernels; `label` names their rows in the profile.
+    pub fn new(gpu: &Gpu, label: &str, shape: LayerShape, handle: WeightHandle) -> Result<Layer> {
+        let bias = u32::from(handle.bias.is_some());
+        let base = linear::Shape {
+            inputs: shape.inputs,
+            outputs: shape.outputs,
+            weight_columns: shape.inputs,
+            transposed: 0,
+            bias,
+            activation: shape.activation as u32,
+            gated: 0,
+            tile: tile(shape.outputs),
+        };
+        let backward = if shape.backward_inputs > 0 {
+            let adjoint = linear::Shape {
+                inputs: shape.outputs,
+                outputs: shape.backward_inputs,
+                transposed: 1,
+                bias: 0,
+                activation: 0,
+                gated: u32::from(shape.inputs_are_relu),
+                tile: tile(shape.backward_inputs),
+                ..base
+            };
+            Some((
+                shape.backward_inputs,
+                gpu.kernel(adjoint)?.labelled(&format!("{label} backward")),
+            ))
+        } else {
+            None
+        };
+        Ok(Layer {
+            inputs: shape.inputs,
+            outputs: shape.outputs,
+            first_row: shape.first_row,
+            handle,
+            forward: gpu.kernel(base)?.labelled(&format!("{label} forward")),
+            backward,
+            gradient: gpu
+                .kernel(weight_gradient::Shape {
+                    inputs: shape.inputs,
+                    outputs: shape.outputs,
+                    bias,
+                })?
+                .labelled(label),
+        })
+    }
+
+    /// Output channels.
+    pub fn outputs(&self) -> u32 {
+        self.outputs
+    }
+
+    fn weight_offset(&self) -> u64 {
+        u64::from(self.first_row) * u64::from(self.inputs)
+    }
+
+    fn work(&self, n: u32, outputs: u32) -> Work {
+        Work::items(u64::from(n))
+            .slices(outputs.div_ceil(tile(outputs)))
+            .flops(2.0 * f64::from(self.inputs) * f64::from(self.outputs))
+            .bytes(4.0 * f64::from(self.inputs + self.outputs))
+    }
+
+    /// `y [outputs, n]` from `x [inputs, n]`.
+    pub fn forward(
+        &self,
+        rec: &mut Recorder,
+        params: &Params,
+        x: Ptr<f32>,
+        y: PtrMut<f32>,
+        n: u32,
+    ) {
+        let args = linear::Args {
+            x,
+            weight: params.weight(self.handle, self.weight_offset()),
+            bias: params.bias(self.handle, u64::from(self.first_row)),
+            gate: x,
+            y,
+            n,
+        };
+        rec.run(&self.forward, self.work(n, self.outputs), args);
+    }
+
+    /// `d_x [backward_inputs, n]` from the gradient `d_y [outputs, n]` before the activation; `x` gates it where the inputs are ReLU's.
+    pub fn backward(
+        &self,
+        rec: &mut Recorder,
+        params: &Params,
+        d_y: Ptr<f32>,
+        x: Ptr<f32>,
+        d_x: PtrMut<f32>,
+        n: u32,
+    ) {
+        let (outputs, kernel) = self
+            .backward
+            .as_ref()
+            .expect("a layer built without input gradients was asked for them");
+        let args = linear::Args {
+            x: d_y,
+            weight: params.weight(self.handle, self.weight_offset()),
+            bias: params.bias(self.handle, 0),
+            gate: x,
+            y: d_x,
+            n,
+        };
+        rec.run(kernel, self.work(n, *outputs), args);
+    }
+
+    /// Adds the gradients of weights and bias, from `x` (channels `stride_x` apart) and `d_y [outputs, n]`.
+    pub fn gradient(
+        &self,
+        rec: &mut Recorder,
+        params: &Params,
+        x: Ptr<f32>,
+        stride_x: u32,
+        d_y: Ptr<f32>,
+        n: u32,
+    ) {
+        let args = weight_gradient::Args {
+            x,
+            d_y,
+            d_weight: params.d_weight(self.handle, self.weight_offset()),
+            d_bias: params.d_bias(self.handle, u64::from(self.first_row)),
+            n,
+            stride_x,
+            chunk: GRADIENT_CHUNK,
+        };
+        let columns = self.inputs + u32::from(self.handle.bias.is_some());
+        let groups = u64::from(n.div_ceil(GRADIENT_CHUNK));
+        let work = Work::items(groups * 64)
+            .slices(columns.div_ceil(8) * self.outputs.div_ceil(8))
+            .flops(
+                2.0 * f64::from(columns) * f64::from(self.outputs) * f64::from(GRADIENT_CHUNK)
+                    / 64.0,
+            )
+            .bytes(4.0 * f64::from(columns + self.outputs) * f64::from(GRADIENT_CHUNK) / 64.0);
+        rec.run(&self.gradient, work, args);
+    }
+}
+
+/// Output channels per invocation: sixteen, or all of a narrower layer.
+fn tile(outputs: u32) -> u32 {
+    outputs.min(16)
+}

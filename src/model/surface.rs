@@ -1,0 +1,368 @@
+//! The surface: SDF, local scale, geometry features and the colour network (METHOD 2.4, 2.5, 2.7).
+
+use super::field::{Field, FieldBuffers, FieldShape, Scratch};
+use super::hash_grid::HashGrid;
+use super::layer::{Activation, Layer, LayerShape};
+use super::params::{Draws, Group, Init, Params, ParamsPlan};
+use crate::Result;
+use crate::config::Config;
+use crate::gpu::{Buffer, Gpu, Kernel, Ptr, PtrMut, Recorder, Work};
+use crate::kernels::{appearance_backward, shade_backward, shade_forward, sigmoid_backward};
+
+/// Parameters and kernels of the surface's networks.
+pub struct Surface {
+    pub field: Field,
+    heads: Layer,
+    colors: Vec<Layer>,
+    appearance: u64,
+    appearance_dims: u32,
+    geometry: u32,
+    shade_forward: Kernel<shade_forward::Args>,
+    shade_backward: Kernel<shade_backward::Args>,
+    sigmoid_backward: Kernel<sigmoid_backward::Args>,
+    appearance_backward: Kernel<appearance_backward::Args>,
+    tap_range: f32,
+    tap_floor: f32,
+}
+
+/// Activations of the surface at `n` samples and their six taps.
+pub struct SurfaceBuffers {
+    pub n: u32,
+    pub points: Buffer<f32>,  // [3, 7n] samples, then taps +x −x +y −y +z −z
+    pub field: FieldBuffers,  // of the 7n points
+    pub sdf: Buffer<f32>,     // [7, n]
+    pub d_sdf: Buffer<f32>,   // [7, n]
+    pub shading: Buffer<f32>, // [rows, n] glsl/lib/shading.glsl; row 0 is the scale logit
+    pub d_shading: Buffer<f32>, // [rows that receive gradients, n]
+    pub hidden: Vec<Buffer<f32>>, // per hidden colour layer [width, n]
+    pub d_hidden: Vec<Buffer<f32>>,
+    pub rgb: Buffer<f32>,     // [3, n] sigmoid output, not padded
+    pub d_rgb: Buffer<f32>,   // [3, n]
+    pub eikonal: Buffer<f32>, // [n]
+}
+
+/// Samples' companions that shading reads.
+pub struct ShadeInputs {
+    pub tap_draws: Ptr<f32>,  // [n]
+    pub directions: Ptr<f32>, // [3, n_rays]
+    pub ray_view: Ptr<u32>,   // [n_rays]
+    pub n_rays: u32,
+}
+
+const DIRECTION_ENCODING: u32 = 27;
+
+impl Surface {
+    /// The field's shape in this configuration.
+    pub fn field_shape(config: &Config) -> FieldShape {
+        let hash = &config.hash;
+        let grid = HashGrid {
+            levels: hash.levels,
+            base: hash.base,
+            max: hash.max,
+            log2_size: hash.log2_size,
+            features: hash.features,
+        };
+        FieldShape {
+            grid,
+            hidden: config.surface.hidden,
+            coordinates: true,
+            softplus: true,
+        }
+    }
+
+    /// Adds the parameters with NeuRodin's geometric initialisation and builds the kernels. `views` counts appearance codes.
+    pub fn new(gpu: &Gpu, config: &Config, plan: &mut ParamsPlan, views: u32) -> Result<Surface> {
+        let shape = Self::field_shape(config);
+        let (hidden, inputs) = (shape.hidden, shape.inputs());
+        let geometry = config.surface.features;
+
+        // Hidden layer: xyz columns N(0, √2/√hidden), hash columns 0. Heads: all rows N(±√π/√hidden, 1e-4), bias ∓init_bias, so that
+        // f ≈ ‖x‖ − r; mirrored where free space is inside.
+        let mut draws = Draws::new(config.seed, "surface");
+        let deviation = (2.0 / f64::from(hidden)).sqrt();
+        let v = (0..hidden * inputs)
+            .map(|i| {
+                if i % inputs < 3 {
+                    draws.normal(0.0, deviation)
+                } else {
+                    0.0
+                }
+            })
+            .collect();
+        let hidden_weight = plan.add_normalised(
+            Group::Fields,
+            "surface.hidden",
+            u64::from(inputs),
+            v,
+            vec![0.0; hidden as usize],
+        );
+        let sign = if config.surface.inside_out { -1.0 } else { 1.0 };
+        let mean = sign * (std::f64::consts::PI / f64::from(hidden)).sqrt();
+        let rows = 2 + geometry;
+        let v = (0..rows * hidden)
+            .map(|_| draws.normal(mean, 1e-4))
+            .collect();
+        let bias = vec![(-sign * config.surface.init_bias) as f32; rows as usize];
+        let heads_weight =
+            plan.add_normalised(Group::Fields, "surface.heads", u64::from(hidden), v, bias);
+
+        let appearance_dims = config.appearance.dims;
+        let color_inputs = geometry + 3 + appearance_dims + 3 + DIRECTION_ENCODING;
+        let widths: Vec<u32> = std::iter::once(color_inputs)
+            .chain(std::iter::repeat_n(
+                config.color.hidden,
+                config.color.layers as usize,
+            ))
+            .chain([3])
+            .collect();
+        let mut draws = Draws::new(config.seed, "color");
+        let mut colors = Vec::new();
+        for (layer, pair) in widths.windows(2).enumerate() {
+            let (n_in, n_out) = (pair[0], pair[1]);
+            let last = layer + 2 == widths.len();
+            // PyTorch's default: weights and bias U(±1/√fan_in).
+            let bound = 1.0 / f64::from(n_in).sqrt();
+            let v = (0..n_in * n_out).map(|_| draws.symmetric(bound)).collect();
+            let bias = (0..n_out).map(|_| draws.symmetric(bound)).collect();
+            let name = format!("color.{layer}");
+            let handle = plan.add_normalised(Group::Fields, &name, u64::from(n_in), v, bias);
+            let shape = LayerShape {
+                inputs: n_in,
+                outputs: n_out,
+                first_row: 0,
+                activation: if last {
+                    Activation::Sigmoid
+                } else {
+                    Activation::Relu
+                },
+                backward_inputs: if layer == 0 {
+                    geometry + 3 + appearance_dims
+                } else {
+                    n_in
+                },
+                inputs_are_relu: layer > 0,
+            };
+            colors.push(Layer::new(gpu, &name, shape, handle)?);
+        }
+        let mut draws = Draws::new(config.seed, "appearance");
+        let codes = (0..views * appearance_dims)
+            .map(|_| draws.normal(0.0, 1.0))
+            .collect();
+        let appearance = plan.add(
+            Group::Fields,
+            "appearance",
+            &[u64::from(views), u64::from(appearance_dims)],
+            Init::Values(codes),
+        );
+        let entries = shape.grid.entries();
+        let table = plan.add(
+            Group::Table,
+            "surface.table",
+            &[entries, u64::from(shape.grid.features)],
+            Init::Uniform { half_range: 1e-4 },
+        );
+
+        let head_shape = LayerShape {
+            inputs: hidden,
+            outputs: 1 + geometry,
+            first_row: 1,
+            activation: Activation::None,
+            backward_inputs: hidden,
+            inputs_are_relu: false,
+        };
+        Ok(Surface {
+            field: Field::new(gpu, "surface", shape, table, hidden_weight, heads_weight)?,
+            heads: Layer::new(gpu, "heads", head_shape, heads_weight)?,
+            colors,
+            appearance,
+            appearance_dims,
+            geometry,
+            shade_forward: gpu.kernel(shade_forward::Shape {
+                geometry,
+                appearance: appearance_dims,
+            })?,
+            shade_backward: gpu.kernel(shade_backward::Shape {
+                geometry,
+                appearance: appearance_dims,
+            })?,
+            sigmoid_backward: gpu.kernel(sigmoid_backward::Shape::default())?,
+            appearance_backward: gpu.kernel(appearance_backward::Shape::default())?,
+            tap_range: config.surface.tap_range as f32,
+            tap_floor: 0.25 / config.hash.max as f32,
+        })
+    }
+
+    /// Range and floor of the tap distance δ = max(range·u, floor).
+    pub fn taps(&self) -> (f32, f32) {
+        (self.tap_range, self.tap_floor)
+    }
+
+    fn gradient_rows(&self) -> u32 {
+        1 + self.geometry + 3 + self.appearance_dims
+    }
+
+    /// Buffers for `n` samples.
+    pub fn buffers(&self, gpu: &Gpu, n: u32) -> Result<SurfaceBuffers> {
+        let n64 = u64::from(n);
+        let width = |layer: usize| self.colors[layer].outputs();
+        let hidden_layers = self.colors.len() - 1;
+        let layer_buffers = |name: &str| -> Result<Vec<Buffer<f32>>> {
+            (0..hidden_layers)
+                .map(|l| gpu.scratch(&format!("{name} {l}"), u64::from(width(l)) * n64))
+                .collect()
+        };
+        let rows = u64::from(self.gradient_rows() + 3 + DIRECTION_ENCODING);
+        Ok(SurfaceBuffers {
+            n,
+            points: gpu.scratch("surface points", 3 * 7 * n64)?,
+            field: FieldBuffers::new(gpu, "surface", &self.field.shape, 7 * n, n)?,
+            sdf: gpu.scratch("sdf", 7 * n64)?,
+            d_sdf: gpu.scratch("d_sdf", 7 * n64)?,
+            shading: gpu.scratch("shading", rows * n64)?,
+            d_shading: gpu.scratch("d_shading", u64::from(self.gradient_rows()) * n64)?,
+            hidden: layer_buffers("color hidden")?,
+            d_hidden: layer_buffers("color d_hidden")?,
+            rgb: gpu.scratch("rgb", 3 * n64)?,
+            d_rgb: gpu.scratch("d_rgb", 3 * n64)?,
+            eikonal: gpu.scratch("eikonal", n64)?,
+        })
+    }
+
+    /// SDF at samples and taps, scale logit, gradient and colour of the samples in `b.points`.
+    pub fn forward(
+        &self,
+        rec: &mut Recorder,
+        params: &Params,
+        b: &SurfaceBuffers,
+        inputs: &ShadeInputs,
+    ) {
+        self.field
+            .forward(rec, params, b.points.ptr(), &b.field, b.sdf.ptr_mut());
+        self.heads
+            .forward(rec, params, b.field.hidden.ptr(), b.shading.ptr_mut(), b.n);
+        let args = shade_forward::Args {
+            sdf: b.sdf.ptr(),
+            tap_draws: inputs.tap_draws,
+            points: b.points.ptr(),
+            directions: inputs.directions,
+            ray_view: inputs.ray_view,
+            appearance: params.values().ptr().offset(self.appearance),
+            shading: b.shading.ptr_mut(),
+            eikonal: b.eikonal.ptr_mut(),
+            n: b.n,
+            n_rays: inputs.n_rays,
+            tap_range: self.tap_range,
+            tap_floor: self.tap_floor,
+        };
+        rec.run(
+            &self.shade_forward,
+            Work::items(u64::from(b.n)).flops(200.0).bytes(200.0),
+            args,
+        );
+        let mut x = self.color_inputs(b);
+        for (layer, color) in self.colors.iter().enumerate() {
+            let y = b.hidden.get(layer).unwrap_or(&b.rgb);
+            color.forward(rec, params, x, y.ptr_mut(), b.n);
+            x = y.ptr();
+        }
+    }
+
+    /// Adds all gradients, from `b.d_rgb`, `b.d_sdf` block 0 and the logit's row 0 of `b.d_shading`. `eikonal_scale` is λ/B.
+    pub fn backward(
+        &self,
+        rec: &mut Recorder,
+        params: &Params,
+        b: &SurfaceBuffers,
+        scratch: &Scratch,
+        inputs: &ShadeInputs,
+        eikonal_scale: f32,
+    ) {
+        let n = b.n;
+        let work = Work::items(3 * u64::from(n));
+        let args = sigmoid_backward::Args {
+            y: b.rgb.ptr(),
+            d_y: b.d_rgb.ptr_mut(),
+            n: 3 * n,
+        };
+        rec.run(&self.sigmoid_backward, work, args);
+        let mut d_y = b.d_rgb.ptr();
+        for (layer, color) in self.colors.iter().enumerate().rev() {
+            let (x, d_x) = match layer {
+                0 => (
+                    self.color_inputs(b),
+                    b.d_shading.ptr_mut().offset(u64::from(n)),
+                ),
+                _ => (b.hidden[layer - 1].ptr(), b.d_hidden[layer - 1].ptr_mut()),
+            };
+            color.gradient(rec, params, x, n, d_y, n);
+            color.backward(rec, params, d_y, x, d_x, n);
+            d_y = d_x.read();
+        }
+        let args = shade_backward::Args {
+            shading: b.shading.ptr(),
+            d_shading: b.d_shading.ptr(),
+            tap_draws: inputs.tap_draws,
+            d_sdf: b.d_sdf.ptr_mut(),
+            n,
+            tap_range: self.tap_range,
+            tap_floor: self.tap_floor,
+            eikonal_scale,
+        };
+        rec.run(
+            &self.shade_backward,
+            Work::items(u64::from(n)).flops(30.0).bytes(56.0),
+            args,
+        );
+        if self.appearance_dims > 0 {
+            let args = appearance_backward::Args {
+                d_code: b
+                    .d_shading
+                    .ptr()
+                    .offset(u64::from(1 + self.geometry + 3) * u64::from(n)),
+                ray_view: inputs.ray_view,
+                d_appearance: params.grads().ptr_mut().offset(self.appearance),
+                n_rays: inputs.n_rays,
+                n_samples: n / inputs.n_rays,
+                channels: self.appearance_dims,
+            };
+            rec.run(
+                &self.appearance_backward,
+                Work::items(u64::from(inputs.n_rays * self.appearance_dims)),
+                args,
+            );
+        }
+        let hidden = b.field.hidden.ptr();
+        self.heads
+            .gradient(rec, params, hidden, n, b.d_shading.ptr(), n);
+        self.heads.backward(
+            rec,
+            params,
+            b.d_shading.ptr(),
+            hidden,
+            b.field.d_hidden.ptr_mut(),
+            n,
+        );
+        self.field.backward(
+            rec,
+            params,
+            b.points.ptr(),
+            b.d_sdf.ptr(),
+            &b.field,
+            scratch,
+        );
+    }
+
+    fn color_inputs(&self, b: &SurfaceBuffers) -> Ptr<f32> {
+        b.shading.ptr().offset(u64::from(b.n))
+    }
+
+    /// Element of `shading` at which the gradient's three rows begin.
+    pub fn gradient_row(&self, b: &SurfaceBuffers) -> u64 {
+        u64::from(1 + self.geometry) * u64::from(b.n)
+    }
+
+    /// Where row 0 of the shading gradients, the scale logit's, is to be written.
+    pub fn d_logit(&self, b: &SurfaceBuffers) -> PtrMut<f32> {
+        b.d_shading.ptr_mut()
+    }
+}

@@ -1,0 +1,227 @@
+//! What is wrong with a batch: colour, eikonal, interlevel and bias losses, their sums for the log (METHOD 4).
+
+use super::composite::{Composite, Look};
+use crate::Result;
+use crate::config::{BiasReduction, Config};
+use crate::gpu::{Buffer, Gpu, Kernel, Ptr, Recorder, Work};
+use crate::kernels::{LossTerm, bias_correction, color_loss, heaviest_sample, sum_losses};
+use crate::model::{FieldBuffers, Model, Scratch, Surface};
+
+/// Names of the summed terms, in order; the total of the first five follows as the last number.
+pub const TERMS: [&str; 7] = [
+    "color",
+    "eikonal",
+    "interlevel_0",
+    "interlevel_1",
+    "bias",
+    "mse",
+    "crossing",
+];
+
+/// Kernels and results of the losses of a batch.
+pub struct Loss {
+    pub d_color: Buffer<f32>, // [3, n_rays]
+    pub sums: Buffer<f32>,    // [TERMS + 1] of the last step
+    /// 1 where the last step's loss was not finite.
+    pub bad_step: Buffer<u32>, // [1]
+    color: Buffer<f32>,       // [n_rays]
+    square: Buffer<f32>,      // [n_rays]
+    bias: Buffer<f32>,        // [n_rays]
+    gate: Buffer<f32>,        // [n_rays]
+    heaviest: Buffer<u32>,    // [n_rays]
+    queries: Buffer<f32>,     // [3, 2 n_rays] behind the heaviest sample, by ε and by c
+    query_field: FieldBuffers,
+    query_sdf: Buffer<f32>,   // [2, n_rays]
+    d_query_sdf: Buffer<f32>, // [2, n_rays]
+    terms: Buffer<LossTerm>,
+    color_loss: Kernel<color_loss::Args>,
+    heaviest_sample: Kernel<heaviest_sample::Args>,
+    bias_correction: Kernel<bias_correction::Args>,
+    sum_losses: Kernel<sum_losses::Args>,
+    epsilon: f32,
+    offset: f32,
+    published: u32,
+    need_opaque: u32,
+    n_rays: u32,
+    n_samples: u32,
+}
+
+/// Weights of the loss terms that are constant.
+#[derive(Clone, Copy, Debug)]
+pub struct LossScales {
+    pub eikonal: f32,
+    pub interlevel: f32,
+}
+
+impl Loss {
+    /// Buffers and kernels for a batch of rays.
+    pub fn new(gpu: &Gpu, config: &Config, n_rays: u32) -> Result<Loss> {
+        let n = u64::from(n_rays);
+        let bias = &config.loss.bias;
+        Ok(Loss {
+            d_color: gpu.scratch("d_color", 3 * n)?,
+            sums: gpu.buffer("losses", TERMS.len() as u64 + 1)?,
+            bad_step: gpu.buffer("bad step", 1)?,
+            color: gpu.scratch("color loss", n)?,
+            square: gpu.scratch("square error", n)?,
+            // Zero-filled: stays so where bias correction is off.
+            bias: gpu.buffer("bias loss", n)?,
+            gate: gpu.buffer("bias gate", n)?,
+            heaviest: gpu.scratch("heaviest sample", n)?,
+            queries: gpu.scratch("bias queries", 6 * n)?,
+            query_field: FieldBuffers::new(
+                gpu,
+                "bias",
+                &Surface::field_shape(config),
+                2 * n_rays,
+                0,
+            )?,
+            query_sdf: gpu.scratch("bias sdf", 2 * n)?,
+            d_query_sdf: gpu.scratch("bias d_sdf", 2 * n)?,
+            terms: gpu.buffer("loss terms", TERMS.len() as u64)?,
+            color_loss: gpu.kernel(color_loss::Shape::default())?,
+            heaviest_sample: gpu.kernel(heaviest_sample::Shape::default())?,
+            bias_correction: gpu.kernel(bias_correction::Shape::default())?,
+            sum_losses: gpu.kernel(sum_losses::Shape::default())?,
+            epsilon: bias.epsilon as f32,
+            offset: bias.offset as f32,
+            published: u32::from(bias.reduction == BiasReduction::Published),
+            need_opaque: u32::from(!config.surface.inside_out),
+            n_rays,
+            n_samples: config.sampling.samples,
+        })
+    }
+
+    /// Colour loss and its gradient.
+    pub fn color(&self, rec: &mut Recorder, composite: &Composite, look: &Look) {
+        let args = color_loss::Args {
+            image: composite.image.ptr(),
+            target: look.rays.target.ptr(),
+            loss: self.color.ptr_mut(),
+            square: self.square.ptr_mut(),
+            d_color: self.d_color.ptr_mut(),
+            n: self.n_rays,
+            scale: 1.0 / self.n_rays as f32,
+        };
+        rec.run(
+            &self.color_loss,
+            Work::items(u64::from(self.n_rays)).flops(20.0).bytes(50.0),
+            args,
+        );
+    }
+
+    /// Explicit bias correction (METHOD 4.3): finds each ray's heaviest sample, asks the SDF just behind it, and pushes it below zero
+    /// where it still is free space. Adds the gradients.
+    pub fn bias(
+        &self,
+        rec: &mut Recorder,
+        model: &Model,
+        composite: &Composite,
+        look: &Look,
+        scratch: &Scratch,
+        weight: f32,
+    ) {
+        let args = heaviest_sample::Args {
+            weights: composite.weights.ptr(),
+            sdf: look.surface.sdf.ptr(),
+            edges: look.sampler.edges.ptr(),
+            near_far: look.rays.near_far.ptr(),
+            ray_outside: look.rays.outside.ptr(),
+            origins: look.rays.origins.ptr(),
+            directions: look.rays.directions.ptr(),
+            queries: self.queries.ptr_mut(),
+            gate: self.gate.ptr_mut(),
+            heaviest: self.heaviest.ptr_mut(),
+            n: self.n_rays,
+            n_samples: self.n_samples,
+            eps: self.epsilon,
+            offset: self.offset,
+            need_opaque: self.need_opaque,
+        };
+        let samples = f64::from(self.n_samples);
+        // One subgroup a ray, whatever its size: the kernel strides over the rays.
+        rec.run(
+            &self.heaviest_sample,
+            Work::items(u64::from(self.n_rays) * 64)
+                .flops(samples / 8.0)
+                .bytes(samples / 8.0),
+            args,
+        );
+        model.surface.field.forward(
+            rec,
+            &model.params,
+            self.queries.ptr(),
+            &self.query_field,
+            self.query_sdf.ptr_mut(),
+        );
+        let args = bias_correction::Args {
+            query_sdf: self.query_sdf.ptr(),
+            gate: self.gate.ptr(),
+            loss: self.bias.ptr_mut(),
+            d_query_sdf: self.d_query_sdf.ptr_mut(),
+            n: self.n_rays,
+            eps: self.epsilon,
+            scale: weight / self.n_rays as f32,
+            published: self.published,
+        };
+        rec.run(
+            &self.bias_correction,
+            Work::items(1).bytes(20.0 * f64::from(self.n_rays)),
+            args,
+        );
+        model.surface.field.backward(
+            rec,
+            &model.params,
+            self.queries.ptr(),
+            self.d_query_sdf.ptr(),
+            &self.query_field,
+            scratch,
+        );
+    }
+
+    /// The table of what to sum. `weights` scale the terms as they enter the total.
+    pub fn set_terms(
+        &self,
+        gpu: &Gpu,
+        eikonal: &Buffer<f32>,
+        interlevel: &[Buffer<f32>],
+        weights: LossScales,
+    ) -> Result<()> {
+        let per_ray = 1.0 / self.n_rays as f32;
+        let term = |values: Ptr<f32>, count: u32, scale: f32, counts: u32| LossTerm {
+            values,
+            count,
+            scale,
+            counts,
+            padding: 0,
+        };
+        let n = self.n_rays;
+        let n_all = n * self.n_samples;
+        let terms = [
+            term(self.color.ptr(), n, per_ray, 1),
+            term(eikonal.ptr(), n_all, weights.eikonal / n_all as f32, 1),
+            term(interlevel[0].ptr(), n, weights.interlevel * per_ray, 1),
+            term(interlevel[1].ptr(), n, weights.interlevel * per_ray, 1),
+            term(self.bias.ptr(), n, 1.0, 1), // weighted where it is computed: its weight changes with time
+            term(self.square.ptr(), n, per_ray, 0),
+            term(self.gate.ptr(), n, per_ray, 0),
+        ];
+        gpu.upload(&self.terms, 0, &terms)
+    }
+
+    /// Sums all terms in a fixed order, into `self.sums`, and flags a sum that is not finite.
+    pub fn sum(&self, rec: &mut Recorder) {
+        rec.fill(&self.bad_step, 0..1, 0);
+        let args = sum_losses::Args {
+            terms: self.terms.ptr(),
+            losses: self.sums.ptr_mut(),
+            non_finite: self.bad_step.ptr_mut(),
+            n_terms: TERMS.len() as u32,
+        };
+        rec.run(
+            &self.sum_losses,
+            Work::items(1).bytes(4.0 * f64::from(self.n_rays * self.n_samples)),
+            args,
+        );
+    }
+}

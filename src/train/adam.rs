@@ -1,0 +1,62 @@
+//! AdamW over the parameter block, one launch per group: the groups differ in learning rate and weight decay.
+
+use super::schedule::Now;
+use crate::Result;
+use crate::config::{Config, OptimizerConfig};
+use crate::gpu::{Buffer, Gpu, Kernel, Recorder, Work};
+use crate::kernels::adam;
+use crate::model::{Group, Params};
+
+/// The optimiser of all parameter groups.
+pub struct Adam {
+    config: OptimizerConfig,
+    kernel: Kernel<adam::Args>,
+}
+
+impl Adam {
+    /// The optimiser of a configuration.
+    pub fn new(gpu: &Gpu, config: &Config) -> Result<Adam> {
+        Ok(Adam {
+            config: config.optimizer.clone(),
+            kernel: gpu.kernel(adam::Shape::default())?,
+        })
+    }
+
+    /// One update of every parameter with the rates of `now`; gradients are consumed. `now.step` counts from 0.
+    pub fn update(&self, rec: &mut Recorder, params: &Params, now: &Now, bad_step: &Buffer<u32>) {
+        let c = &self.config;
+        let t = (now.step + 1) as f64;
+        let groups = [
+            (Group::Fields, now.lr_fields, c.fields.weight_decay),
+            (Group::Table, now.lr_table, c.table.weight_decay),
+            (Group::Proposal, now.lr_proposal, c.proposal.weight_decay),
+            (
+                Group::Background,
+                now.lr_background,
+                c.background.weight_decay,
+            ),
+        ];
+        for (group, learning_rate, weight_decay) in groups {
+            let Some(range) = params.group(group) else {
+                continue;
+            };
+            let n = range.end - range.start;
+            let args = adam::Args {
+                params: params.values().at_mut(range.start),
+                grads: params.grads().at_mut(range.start),
+                first_moment: params.first_moment().at_mut(range.start),
+                second_moment: params.second_moment().at_mut(range.start),
+                bad_step: bad_step.ptr(),
+                n: n as u32,
+                learning_rate: learning_rate as f32,
+                weight_decay: weight_decay as f32,
+                beta1: c.beta1 as f32,
+                beta2: c.beta2 as f32,
+                correction1: (1.0 - c.beta1.powf(t)) as f32,
+                correction2: (1.0 - c.beta2.powf(t)).sqrt() as f32,
+                epsilon: c.epsilon as f32,
+            };
+            rec.run(&self.kernel, Work::items(n).flops(15.0).bytes(32.0), args);
+        }
+    }
+}

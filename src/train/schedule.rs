@@ -1,0 +1,190 @@
+//! Every number that changes with time, as a function of the step alone.
+//!
+//! Closed forms (METHOD 1.2, 1.3), k the time in schedule steps:
+//!   scale bound   1/β ≥ a + (b - a) log₂(1 + min(k, K)/K)
+//!   bias weight   the same form, from `weight_start` to `weight`
+//!   annealing     10x / (9x + 1), x = min(k/K, 1): exponent of the proposal weights (Barron et al. 2022)
+//!   multi-step    min(k/warmup, 1) · γ^(milestones passed)
+//!   exponential   a^(1-x) b^x, x = min(k/K, 1)
+//! A run of another length than `schedule_steps` is the same schedule, stretched: k = step · schedule_steps / steps, not rounded.
+
+use crate::config::{Config, Drop, Exponential, MultiStep};
+
+/// The schedules of a run.
+#[derive(Clone, Debug)]
+pub struct Schedule {
+    config: Config,
+}
+
+/// All annealed numbers of one step.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Now {
+    /// The step that these belong to.
+    pub step: u64,
+    /// Learning rate of the surface and colour networks and the appearance codes.
+    pub lr_fields: f64,
+    /// Learning rate of the signed distance's hash grid.
+    pub lr_table: f64,
+    /// Learning rate of the proposal networks.
+    pub lr_proposal: f64,
+    /// Learning rate of the background.
+    pub lr_background: f64,
+    /// Exponent of the proposal weights, 0 to 1.
+    pub anneal: f64,
+    /// Lower bound of 1/β, in inverse region units.
+    pub inv_s_lower: f64,
+    /// Weight of the explicit bias correction.
+    pub bias_weight: f64,
+}
+
+impl Schedule {
+    /// The schedules of a configuration.
+    pub fn new(config: &Config) -> Schedule {
+        Schedule {
+            config: config.clone(),
+        }
+    }
+
+    /// Where the schedule stands at a training step (counted from 0): schedule steps, not whole in general.
+    pub fn time(&self, step: u64) -> f64 {
+        // One rounding only, so that milestones are hit exactly wherever they can be.
+        (u128::from(step) * u128::from(self.config.schedule_steps)) as f64
+            / self.config.steps as f64
+    }
+
+    /// The numbers for a training step, counted from 0. Beyond the end of the run they stay as at its end.
+    pub fn at(&self, step: u64) -> Now {
+        let k = self.time(step.min(self.config.steps));
+        let Config {
+            sampling,
+            loss,
+            optimizer,
+            schedule_steps,
+            ..
+        } = &self.config;
+        let bias = &loss.bias;
+        let bound = &loss.scale_bound;
+        Now {
+            step,
+            lr_fields: multi_step(&optimizer.fields, k),
+            lr_table: multi_step(&optimizer.table, k),
+            lr_proposal: multi_step(&optimizer.proposal, k),
+            lr_background: exponential(&optimizer.background, k / *schedule_steps as f64),
+            anneal: anneal(k / sampling.anneal_steps as f64),
+            inv_s_lower: logarithmic(bound.start, bound.end, bound.steps, k),
+            bias_weight: logarithmic(bias.weight_start, bias.weight, bias.ramp_steps, k),
+        }
+    }
+}
+
+/// From `start` to `end` within `steps`, as log₂(1 + x): fast first. Zero steps: `end` from the beginning.
+fn logarithmic(start: f64, end: f64, steps: u64, k: f64) -> f64 {
+    if k >= steps as f64 {
+        return end;
+    }
+    start + (end - start) * (1.0 + k / steps as f64).log2()
+}
+
+fn anneal(x: f64) -> f64 {
+    let x = x.min(1.0);
+    10.0 * x / (9.0 * x + 1.0)
+}
+
+fn multi_step(group: &MultiStep, k: f64) -> f64 {
+    let warmup = group.warmup as f64;
+    let rise = if k < warmup { k / warmup } else { 1.0 };
+    let passed = group
+        .milestones
+        .iter()
+        .map(|milestone| *milestone as f64)
+        .filter(|milestone| match group.drop {
+            Drop::At => *milestone <= k,
+            Drop::After => *milestone < k,
+        })
+        .count();
+    group.learning_rate * rise * group.gamma.powi(passed as i32)
+}
+
+fn exponential(group: &Exponential, x: f64) -> f64 {
+    let x = x.min(1.0);
+    ((1.0 - x) * group.learning_rate.ln() + x * group.learning_rate_end.ln()).exp()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The table of METHOD 1.3, to the digits printed there.
+    #[test]
+    fn published_table() {
+        let outdoor = Schedule::new(&Config::default());
+        let indoor = Schedule::new(&Config::preset("indoor-large").unwrap());
+        for (step, bound, bias, anneal) in [
+            (0, 0.01, 0.001, 0.0),
+            (1_000, 0.586, 0.00774, 0.526),
+            (5_000, 2.87, 0.0297, 0.909),
+            (10_000, 5.67, 0.05, 1.0),
+            (20_000, 11.11, 0.05, 1.0),
+            (50_000, 26.31, 0.05, 1.0),
+            (100_000, 48.55, 0.05, 1.0),
+            (200_000, 84.80, 0.05, 1.0),
+            (250_000, 100.0, 0.05, 1.0),
+            (300_000, 100.0, 0.05, 1.0),
+        ] {
+            let (now, room) = (outdoor.at(step), indoor.at(step));
+            assert!((now.inv_s_lower / bound - 1.0).abs() < 2e-3, "{now:?}");
+            assert!((room.bias_weight / bias - 1.0).abs() < 2e-3, "{room:?}");
+            assert!((now.anneal - anneal).abs() < 5e-4, "{now:?}");
+            assert_eq!(now.bias_weight, 0.1, "constant outdoors");
+        }
+    }
+
+    /// Warm-up and both sides of every milestone (METHOD 1.2).
+    #[test]
+    fn learning_rates() {
+        let schedule = Schedule::new(&Config::default());
+        for (step, fields, proposal) in [
+            (0, 0.0, 1.0),
+            (1, 1.0 / 5000.0, 1.0),
+            (4_999, 4999.0 / 5000.0, 1.0),
+            (5_000, 1.0, 1.0),
+            (149_999, 1.0, 1.0),
+            (150_000, 1.0, 0.33),
+            (160_000, 1.0, 0.33),
+            (160_001, 0.1, 0.33),
+            (225_000, 0.1, 0.33 * 0.33),
+            (240_000, 0.1, 0.33 * 0.33),
+            (240_001, 0.01, 0.33 * 0.33),
+            (270_000, 0.01, 0.33 * 0.33 * 0.33),
+        ] {
+            let now = schedule.at(step);
+            assert!((now.lr_fields - 1e-3 * fields).abs() < 1e-15, "{now:?}");
+            assert_eq!(now.lr_table, now.lr_fields);
+            assert!((now.lr_proposal - 1e-2 * proposal).abs() < 1e-14, "{now:?}");
+        }
+        assert!((schedule.at(0).lr_background - 1e-2).abs() < 1e-15);
+        assert!((schedule.at(150_000).lr_background - 1e-3).abs() < 1e-15);
+        assert!((schedule.at(300_000).lr_background - 1e-4).abs() < 1e-15);
+    }
+
+    /// A short run passes through the same numbers at the same fractions, milestones included.
+    #[test]
+    fn stretched() {
+        let long = Schedule::new(&Config::default());
+        let short = Schedule::new(&Config {
+            steps: 2_000,
+            ..Config::default()
+        });
+        for step in (0..=2_000).step_by(50) {
+            let (short, long) = (short.at(step), long.at(step * 150));
+            assert_eq!(
+                Now {
+                    step: long.step,
+                    ..short
+                },
+                long
+            );
+        }
+        assert_eq!(short.at(5_000).inv_s_lower, short.at(2_000).inv_s_lower);
+    }
+}
