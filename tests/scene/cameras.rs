@@ -2,6 +2,7 @@
 
 use glam::{DVec2, DVec3};
 use neurodin::scene::{Camera, CameraModel};
+use proptest::prelude::*;
 
 /// One camera per model, with distortion such as calibrations of real lenses give.
 fn cameras() -> Vec<Camera> {
@@ -216,5 +217,46 @@ fn senseless_cameras_are_refused() {
     ] {
         let error = Camera::new(model, width, 480, params).unwrap_err();
         assert!(error.contains(what), "{error}");
+    }
+}
+
+/// Distortion coefficients behind the focal lengths and the centre.
+fn with_coefficients(model: CameraModel, coefficients: &[f64]) -> Camera {
+    let mut params = if model.has_single_focal() {
+        vec![400.0]
+    } else {
+        vec![400.0, 410.0]
+    };
+    params.extend([322.0, 239.0]);
+    let lens = model.param_count() - params.len();
+    params.extend(&coefficients[..lens]);
+    Camera::new(model, 640, 480, params).unwrap()
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { failure_persistence: None, ..ProptestConfig::default() })]
+
+    #[test]
+    fn mild_lenses_are_undone_everywhere(coefficients in prop::collection::vec(-0.008..0.008f64, 8)) {
+        for model in CameraModel::ALL {
+            let camera = with_coefficients(model, &coefficients);
+            for pixel in pixels() {
+                let back = camera.project(camera.direction(pixel));
+                let back = back.unwrap_or_else(|| panic!("{model} {pixel} {coefficients:?}"));
+                prop_assert!((back - pixel).length() <= 1e-6, "{model} {pixel} came back as {back}");
+            }
+        }
+    }
+
+    #[test]
+    fn senseless_lenses_still_give_numbers(coefficients in prop::collection::vec(-50.0..50.0f64, 8)) {
+        for model in CameraModel::ALL {
+            let camera = with_coefficients(model, &coefficients);
+            for pixel in pixels() {
+                let direction = camera.direction(pixel);
+                prop_assert!(direction.is_finite(), "{model} {pixel} {direction}");
+                prop_assert!(camera.project(direction).is_none_or(|pixel| pixel.is_finite()));
+            }
+        }
     }
 }

@@ -1,8 +1,6 @@
 //! The region: what is stated, what is estimated in spite of outliers, and what the preview shows of it.
 
 use glam::{DVec3, Vec3};
-use neurodin::cli::inspect::{InspectArgs, run};
-use neurodin::cli::scene_args::SceneArgs;
 use neurodin::scene::{Facing, Looks, Region, RegionOverrides, RegionShape, Scene, write_preview};
 use serde_json::{Value, json};
 
@@ -367,28 +365,4 @@ fn the_preview_holds_cameras_points_and_region() {
     let nowhere =
         write_preview(&scene, &region, &dataset.at("no/such/folder/preview.ply")).unwrap_err();
     assert_eq!(nowhere.exit_code(), 8);
-}
-
-#[test]
-fn inspect_keeps_an_existing_preview_unless_told() {
-    let (dataset, _) = colmap_scene(&Rig::around_a_ball(8));
-    let mut args = InspectArgs {
-        dataset: dataset.path().to_path_buf(),
-        preview: Some(dataset.at("preview.ply")),
-        force: false,
-        json: true,
-        scene: SceneArgs::default(),
-    };
-    run(&args).unwrap();
-    let first = std::fs::read(dataset.at("preview.ply")).unwrap();
-    args.scene.region_scale = Some(2.0);
-    let error = run(&args).unwrap_err();
-    assert_eq!(
-        error.downcast_ref::<neurodin::Error>().unwrap().exit_code(),
-        8
-    );
-    assert_eq!(std::fs::read(dataset.at("preview.ply")).unwrap(), first);
-    args.force = true;
-    run(&args).unwrap();
-    assert_ne!(std::fs::read(dataset.at("preview.ply")).unwrap(), first);
 }
