@@ -4,7 +4,8 @@
 //! Shapes are the files'.
 
 use crate::harness::*;
-use crate::volume::{Batch, run_bias_correction, run_interlevel};
+use crate::volume_compositing::Batch;
+use crate::volume_losses::{run_bias_correction, run_interlevel};
 use crate::volume_rays::near_far_of;
 use crate::volume_twin::{self as twin, ProposalRay, RaySamples, Scale};
 use neurodin::kernels;
@@ -478,7 +479,7 @@ fn bias_correction() {
     for (scene, need_opaque) in [("outdoor", 1), ("indoor", 0)] {
         let array = |name: &str| format!("{name}_{scene}");
         let (queries, gate) = (device.room("queries", 6 * n), device.room("gate", n));
-        let heaviest = device.room_uints("heaviest", n);
+        let heaviest = device.room("heaviest", n);
         device.run(
             kernels::heaviest_sample::Shape::default(),
             n * device.gpu.info().subgroup_size as usize,
@@ -487,7 +488,7 @@ fn bias_correction() {
                 sdf: device.put("sdf", file.values("sdf")).ptr(),
                 edges: device.put("edges", &edges.repeat(n)).ptr(),
                 near_far: device.put("near_far", &planar(&near_far)).ptr(),
-                ray_outside: device.put_uints("ray_outside", &vec![0; n]).ptr(),
+                ray_outside: device.table("ray_outside", &vec![0; n]).ptr(),
                 origins: device.put("origins", &planar(&origins)).ptr(),
                 directions: device.put("directions", &planar(&directions)).ptr(),
                 queries: queries.ptr_mut(),
