@@ -2,3 +2,4 @@
 
 pub mod inspect;
 pub mod scene_args;
+pub mod demo;

@@ -411,11 +411,10 @@ impl Looks {
             "from the middle of the points, the median camera is {of_cameras:.3} away and the median point {of_points:.3}"
         );
         // Background can outnumber an object's points, but not turn the cameras away from it; a room's far walls lie beyond cameras.
-        let facing = if seeing >= 0.9 && of_cameras > 0.3 * of_points
+        let inward = seeing >= 0.9 && of_cameras > 0.3 * of_points
             || seeing >= 0.5 && of_cameras > of_points
-        {
-            Facing::Inward
-        } else if of_cameras > 1.5 * of_points {
+            || of_cameras > 1.5 * of_points;
+        let facing = if inward {
             Facing::Inward
         } else {
             Facing::Outward
