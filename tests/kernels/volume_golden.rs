@@ -198,10 +198,9 @@ fn interlevel() {
     let near_far = [0.0, f64::from(0.8f32)];
     let (final_edges, final_weights) = (rows(&file, "edges_final"), rows(&file, "w_final"));
     for level in [0, 1] {
-        let (edges, weights) = (
-            rows(&file, &format!("edges{level}")),
-            rows(&file, &format!("w{level}")),
-        );
+        let edges = rows(&file, &format!("edges{level}"));
+        let edges: Vec<Vec<f64>> = edges.into_iter().map(rounded).collect(); // narrow bins feel it
+        let weights = rows(&file, &format!("w{level}"));
         let ray = |i: usize| ProposalRay {
             final_edges: final_edges[i].clone(),
             final_weights: final_weights[i].clone(),
