@@ -27,6 +27,8 @@ pub struct GpuOptions {
     pub profile: bool,
     /// Ignores what only some devices offer, so that the variants run that run everywhere.
     pub portable: bool,
+    /// Bytes of device memory that buffers may take; `None`: what the device has.
+    pub memory_limit: Option<u64>,
     /// Folder that keeps compiled pipelines from one run to the next; `None` keeps none. (Software drivers have their own cache and
     /// ignore this one.)
     pub cache_dir: Option<PathBuf>,
@@ -86,7 +88,7 @@ impl Gpu {
             info.full_subgroups = None;
         }
         let context = Context::new(instance, physical, &info)?;
-        let memory = Memory::new(&context)?;
+        let memory = Memory::new(&context, options.memory_limit)?;
         let pipelines = Pipelines::new(&context, &info, options.cache_dir.as_deref())?;
         let queue = Queue::new(&context)?;
         let profiler = Profiler::new(&info, context.timestamp_bits);

@@ -34,7 +34,7 @@ impl std::fmt::Display for DeviceKind {
 /// A device as the driver describes it.
 #[derive(Clone, Debug)]
 pub struct DeviceInfo {
-    /// Position in [`Gpu::list`], accepted by [`GpuOptions::device`].
+    /// Position in [`super::Gpu::list`], accepted by [`super::GpuOptions::device`].
     pub index: usize,
     pub name: String,
     pub kind: DeviceKind,

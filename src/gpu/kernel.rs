@@ -77,7 +77,7 @@ impl<A> std::fmt::Debug for Kernel<A> {
 }
 
 impl<A> Kernel<A> {
-    /// The same kernel under its own profiler row, "<stem> <label>".
+    /// The same kernel under its own profiler row: its name, a space, `label`.
     pub fn labelled(&self, label: &str) -> Kernel<A> {
         Kernel {
             row: format!("{} {label}", self.module.name).into(),

@@ -7,7 +7,7 @@ use super::profile::Stamps;
 use super::recorder::Recorder;
 use crate::Result;
 use ash::vk;
-use std::sync::Mutex;
+use std::sync::{Mutex, MutexGuard};
 use std::thread::ThreadId;
 
 /// Work that was submitted; done when the timeline semaphore reaches its value.
@@ -91,6 +91,18 @@ impl Queue {
             timeline,
             device: device.clone(),
         })
+    }
+
+    /// The queue's state, for the call `name`; a thread that is recording would wait for itself.
+    fn lock(&self, name: &str) -> MutexGuard<'_, QueueState> {
+        let recording = *self.recording.lock().expect("no panic under the lock");
+        assert!(
+            recording != Some(std::thread::current().id()),
+            "'{name}' inside another submit"
+        );
+        self.state
+            .lock()
+            .unwrap_or_else(|poisoned| poisoned.into_inner())
     }
 
     /// Frees memory now, or when the work that may use it is done.
@@ -232,16 +244,8 @@ impl Gpu {
         record: impl FnOnce(&mut Recorder) -> Result<()>,
     ) -> Result<Ticket> {
         let queue = &self.inner.queue;
-        let me = std::thread::current().id();
-        assert!(
-            *queue.recording.lock().expect("no panic under the lock") != Some(me),
-            "submit '{name}' inside another submit"
-        );
-        let mut state = queue
-            .state
-            .lock()
-            .unwrap_or_else(|poisoned| poisoned.into_inner());
-        let _recording = Recording::begin(queue, me);
+        let mut state = queue.lock(name);
+        let _recording = Recording::begin(queue);
 
         state.current = 1 - state.current;
         let current = state.current;
@@ -276,13 +280,7 @@ impl Gpu {
 
     /// Waits until all submitted work is done.
     pub fn finish(&self) -> Result<()> {
-        let submitted = self
-            .inner
-            .queue
-            .state
-            .lock()
-            .unwrap_or_else(|poisoned| poisoned.into_inner())
-            .submitted;
+        let submitted = self.inner.queue.lock("finish").submitted;
         self.inner.queue.wait(submitted)?;
         self.inner.queue.collect(&self.inner.memory, submitted);
         Ok(())
@@ -291,10 +289,7 @@ impl Gpu {
     /// Waits for everything and reads its timestamps.
     pub(super) fn read_stamps(&self) -> Result<()> {
         let queue = &self.inner.queue;
-        let mut state = queue
-            .state
-            .lock()
-            .unwrap_or_else(|poisoned| poisoned.into_inner());
+        let mut state = queue.lock("profile");
         queue.wait(state.submitted)?;
         let older = 1 - state.current;
         for slot in [older, 1 - older] {
@@ -315,7 +310,8 @@ impl Gpu {
 struct Recording<'a>(&'a Queue);
 
 impl<'a> Recording<'a> {
-    fn begin(queue: &'a Queue, thread: ThreadId) -> Self {
+    fn begin(queue: &'a Queue) -> Self {
+        let thread = std::thread::current().id();
         *queue.recording.lock().expect("no panic under the lock") = Some(thread);
         Recording(queue)
     }

@@ -23,22 +23,27 @@ fn what_does_not_fit_is_refused_with_its_numbers() -> Result<()> {
         .buffer::<f32>("table", u64::MAX / 4)
         .expect_err("larger than any address");
     assert!(matches!(error, Error::OutOfMemory { .. }), "{error}");
-    // Piece by piece until the budget is spent; scratch is never touched, so the pieces cost nothing.
-    let piece = (gpu.info().max_buffer / 4).min(1 << 29) - (1 << 15);
-    let mut pieces = Vec::new();
-    let error = loop {
-        match gpu.scratch::<f32>("piece", piece) {
-            Ok(buffer) => pieces.push(buffer),
-            Err(error) => break error,
-        }
-        assert!(pieces.len() < 1000, "no budget ends this");
-    };
+    drop(held);
+
+    // A limit of 16 MiB takes three buffers of 4 MiB with their padding, and a fourth when one of them goes.
+    let gpu = Gpu::new(&GpuOptions {
+        memory_limit: Some(16 << 20),
+        ..watched()
+    })?;
+    let four = |name: &str| gpu.buffer::<f32>(name, 1 << 20);
+    let (_a, b, c) = (four("a")?, four("b")?, four("c")?);
+    let error = four("d").expect_err("more than the limit");
     let text = error.to_string();
+    assert!(matches!(error, Error::OutOfMemory { .. }), "{text}");
     assert!(
-        matches!(error, Error::OutOfMemory { .. }) && text.contains("held: piece"),
+        text.contains("'d' needs 4.0 MiB; of 16.0 MiB")
+            && text.contains("held: a 4.0 MiB, b 4.0 MiB"),
         "{text}"
     );
-    assert_eq!(gpu.download(&held, 0, 1)?, [0.0]);
+    drop(b);
+    let d = four("d")?;
+    assert_eq!(gpu.download(&c, 0, 1)?, gpu.download(&d, 0, 1)?);
+    assert_eq!(gpu.memory_plan().budget, 16 << 20);
     Ok(())
 }
 

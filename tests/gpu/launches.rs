@@ -1,9 +1,9 @@
 //! Kernels: every item, every index, every constant.
 
-use crate::{copy_and_compare, fill_and_look, open};
+use crate::{copy_and_compare, fill_and_look, open, watched};
 use neurodin::Result;
-use neurodin::gpu::Work;
-use neurodin::kernels::roof_fma;
+use neurodin::gpu::{Gpu, GpuOptions, Work};
+use neurodin::kernels::{appearance_backward, roof_fma};
 
 #[test]
 fn a_kernel_reaches_every_item() -> Result<()> {
@@ -53,5 +53,42 @@ fn roofs_are_measured() -> Result<()> {
         roofs.fma_gflop_s > 0.1 && roofs.fma_gflop_s < 1e6,
         "{roofs:?}"
     );
+    Ok(())
+}
+
+#[test]
+fn adding_to_one_float_from_everywhere_loses_nothing() -> Result<()> {
+    for portable in [false, true] {
+        let gpu = Gpu::new(&GpuOptions {
+            portable,
+            ..watched()
+        })?;
+        let n = 20_000; // rays of one sample and one channel, all of the first view
+        let (ones, views) = (
+            gpu.buffer::<f32>("ones", n)?,
+            gpu.buffer::<u32>("views", n)?,
+        );
+        gpu.upload(&ones, 0, &vec![1.0; n as usize])?;
+        let sum = gpu.buffer::<f32>("sum", 1)?;
+        let kernel = gpu.kernel(appearance_backward::Shape::default())?;
+        gpu.submit("add", |rec| {
+            let args = appearance_backward::Args {
+                d_code: ones.ptr(),
+                ray_view: views.ptr(),
+                d_appearance: sum.ptr_mut(),
+                n_rays: n as u32,
+                n_samples: 1,
+                channels: 1,
+            };
+            rec.run(&kernel, Work::items(n), args);
+            Ok(())
+        })?;
+        assert_eq!(
+            gpu.download(&sum, 0, 1)?,
+            [n as f32],
+            "portable: {portable}"
+        );
+        assert_eq!(gpu.check_guards()?, []);
+    }
     Ok(())
 }
