@@ -4,8 +4,7 @@ use super::progress::Progress;
 use super::{Context, interrupt, scene_args};
 use crate::Error;
 use crate::gpu::Gpu;
-use crate::mesh::{Domain, ExtractOptions, Field, Mesh, clean, extract, write};
-use crate::scene::RegionShape;
+use crate::mesh::{ExtractOptions, Field, Mesh, clean, extract, write};
 use crate::train::run_directory::RunDirectory;
 use crate::train::trained::Trained;
 use clap::{Args, ValueEnum};
@@ -85,14 +84,9 @@ pub(super) fn run(args: &MeshArgs, context: &Context) -> anyhow::Result<()> {
     let world_from_region = trained.region.world_from_region();
     let options = ExtractOptions {
         resolution: args.resolution,
-        domain: match trained.region.shape {
-            RegionShape::Sphere => Domain::Sphere,
-            RegionShape::Box { half } => Domain::Box { half },
-        },
-        world_from_region,
         crop: args.crop.map(corners),
         steepest: (!args.exhaustive).then_some(STEEPEST),
-        ..ExtractOptions::default()
+        ..ExtractOptions::of(&trained.region)
     };
     let (mut mesh, stats) = surface(&gpu, &trained, &options, context)?;
     if stats.steepest > STEEPEST {

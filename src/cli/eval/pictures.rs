@@ -1,6 +1,7 @@
 //! The picture half of `neurodin eval`: PSNR and SSIM of a run's held-out views.
 
 use super::EvalArgs;
+use crate::Error;
 use crate::cli::progress::Progress;
 use crate::cli::{Context, interrupt};
 use crate::config::MaskUse;
@@ -9,7 +10,6 @@ use crate::render::Rendered;
 use crate::scene::{Picture, Split};
 use crate::train::run_directory::RunDirectory;
 use crate::train::trained::Trained;
-use crate::{Error, Result};
 use serde_json::{Value, json};
 use std::fmt::Write;
 use std::path::Path;
@@ -62,11 +62,11 @@ pub(super) fn score(
         scores.push((name, psnr, ssim));
     }
     drop(progress);
-    let mean = |of: &dyn Fn(&(&String, f64, Option<f64>)) -> Option<f64>| {
-        let present: Vec<f64> = scores.iter().filter_map(of).collect();
+    let mean = |present: Vec<f64>| {
         (!present.is_empty()).then(|| present.iter().sum::<f64>() / present.len() as f64)
     };
-    let (mean_psnr, mean_ssim) = (mean(&|score| Some(score.1)), mean(&|score| score.2));
+    let mean_psnr = mean(scores.iter().map(|(_, psnr, _)| *psnr).collect());
+    let mean_ssim = mean(scores.iter().filter_map(|(.., ssim)| *ssim).collect());
     let in_words =
         |ssim: Option<f64>| ssim.map_or("too small for SSIM".into(), |ssim| format!("{ssim:.4}"));
     let mut text = String::new();
