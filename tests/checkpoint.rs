@@ -360,18 +360,13 @@ fn the_newly_written_one_is_never_removed() {
 
 const KILLED: &str = "NEURODIN_TEST_CHECKPOINTS";
 
-/// Saves until it is killed.
-#[test]
-#[ignore = "the kill test runs this in a process of its own"]
-fn saves_for_ever() {
-    let folder = PathBuf::from(std::env::var_os(KILLED).expect("the kill test says where"));
-    let mut step = checkpoint::files(&folder)
-        .unwrap()
-        .last()
-        .map_or(0, |(step, _)| *step);
+/// Saves until the process is killed.
+fn save_for_ever(folder: &Path) -> ! {
+    let newest = checkpoint::files(folder).unwrap().pop();
+    let mut step = newest.map_or(0, |(step, _)| step);
     loop {
         step += 1;
-        save(&folder, step, &tensors()).unwrap();
+        save(folder, step, &tensors()).unwrap();
     }
 }
 
@@ -379,13 +374,17 @@ fn saves_for_ever() {
 #[test]
 #[cfg(unix)]
 fn killing_never_costs_the_checkpoint() {
+    // The process to be killed is this test once more.
+    if let Some(folder) = std::env::var_os(KILLED) {
+        save_for_ever(Path::new(&folder));
+    }
     let folder = tempfile::tempdir().unwrap();
     save(folder.path(), 1, &tensors()).unwrap();
     let mut newest = 1;
     let mut died_saving = 0;
     for round in 0..100u64 {
         let mut child = std::process::Command::new(std::env::current_exe().unwrap())
-            .args(["--ignored", "--exact", "saves_for_ever"])
+            .args(["--exact", "killing_never_costs_the_checkpoint"])
             .env(KILLED, folder.path())
             .stdout(std::process::Stdio::null())
             .stderr(std::process::Stdio::null())

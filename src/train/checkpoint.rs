@@ -67,7 +67,7 @@ impl Tensor {
 /// Where a save gets its numbers: the elements of a tensor in a range of indices.
 pub type Source<'s> = dyn FnMut(&Tensor, Range<u64>) -> Result<Vec<f32>> + 's;
 
-/// Writes `folder/step-XXXXXXXX.safetensors`, then removes what is beyond the newest `keep` of that folder.
+/// Writes a checkpoint, named after its step, then removes what is beyond the newest `keep` of that folder.
 ///
 /// `read` returns elements of a tensor; it is called for every tensor in turn, for consecutive ranges of at most [`PIECE`].
 ///
@@ -132,7 +132,7 @@ pub fn save(
     Ok(path)
 }
 
-/// `folder/step-XXXXXXXX.safetensors`.
+/// `step-00012345.safetensors` for step 12345.
 fn path_of(folder: &Path, step: u64) -> PathBuf {
     folder.join(format!("step-{step:08}.safetensors"))
 }

@@ -1,3 +1,8 @@
+//! What a run tells while it lasts.
+//!
+//! The library prints nothing: everything that happens leaves as an [`Event`], whose receiver answers whether to go on. A [`Log`] keeps
+//! events as lines of JSON.
+
 use crate::{Error, Result};
 use serde_json::{Map, Value, json};
 use std::collections::VecDeque;
@@ -356,6 +361,7 @@ mod tests {
                 "loss.bias",
                 "loss.interlevel",
                 "psnr",
+                "crossing",
                 "it_per_s"
             ]
         );
