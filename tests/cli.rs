@@ -1,0 +1,581 @@
+//! The command line from outside: streams, exit codes, messages, and one small run from photographs to mesh.
+
+use serde_json::Value;
+use std::f64::consts::TAU;
+use std::fs;
+use std::path::Path;
+use std::process::{Command, Output, Stdio};
+use std::time::{Duration, Instant};
+
+/// The program, in an environment without anyone's settings.
+fn neurodin(words: &[&str]) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_neurodin"));
+    for (name, _) in std::env::vars_os() {
+        if name.to_string_lossy().starts_with("NEURODIN_") {
+            command.env_remove(name);
+        }
+    }
+    command
+        .env_remove("RUST_LOG")
+        .env_remove("RUST_BACKTRACE")
+        .args(words);
+    command
+}
+
+struct Said {
+    code: Option<i32>,
+    stdout: String,
+    stderr: String,
+}
+
+fn said(output: Output) -> Said {
+    Said {
+        code: output.status.code(),
+        stdout: String::from_utf8(output.stdout).unwrap(),
+        stderr: String::from_utf8(output.stderr).unwrap(),
+    }
+}
+
+fn run(words: &[&str]) -> Said {
+    said(neurodin(words).output().unwrap())
+}
+
+/// Runs to failure with an exit code, nothing on stdout, and all of `parts` in the message.
+fn fails(words: &[&str], code: i32, parts: &[&str]) -> String {
+    let said = run(words);
+    assert_eq!(said.code, Some(code), "{words:?}: {}", said.stderr);
+    assert_eq!(said.stdout, "", "{words:?}");
+    for part in parts {
+        assert!(
+            said.stderr.contains(part),
+            "{words:?}: no '{part}' in: {}",
+            said.stderr
+        );
+    }
+    said.stderr
+}
+
+/// A white ball on a coloured gradient, seen from a ring of cameras: a dataset in the dialect that states its region.
+fn write_dataset(folder: &Path) {
+    let (width, height, focal) = (24u32, 18u32, 22.0);
+    fs::create_dir_all(folder.join("images")).unwrap();
+    let mut frames = Vec::new();
+    for view in 0..9 {
+        let angle = TAU * f64::from(view) / 9.0;
+        let (sin, cos) = angle.sin_cos();
+        // Camera axes in the world: x right, y up, looking along -z at the origin from 3 away.
+        let pose = [
+            [-sin, 0.0, cos, 3.0 * cos],
+            [cos, 0.0, sin, 3.0 * sin],
+            [0.0, 1.0, 0.0, 0.0],
+            [0.0, 0.0, 0.0, 1.0],
+        ];
+        let picture = image::RgbImage::from_fn(width, height, |x, y| {
+            let (dx, dy) = (f64::from(x) + 0.5 - 12.0, f64::from(y) + 0.5 - 9.0);
+            match (dx * dx + dy * dy).sqrt() < 4.0 {
+                true => image::Rgb([250, 240, 230]),
+                false => image::Rgb([40, 90, (120 + 5 * y) as u8]),
+            }
+        });
+        let name = format!("images/view{view}.png");
+        picture.save(folder.join(&name)).unwrap();
+        frames.push(serde_json::json!({ "file_path": name, "transform_matrix": pose }));
+    }
+    let transforms = serde_json::json!({
+        "w": width, "h": height, "fl_x": focal, "fl_y": focal, "cx": 12.0, "cy": 9.0,
+        "sphere_center": [0.0, 0.0, 0.0], "sphere_radius": 1.0, "frames": frames,
+    });
+    fs::write(folder.join("transforms.json"), transforms.to_string()).unwrap();
+}
+
+/// Settings with which a step takes milliseconds anywhere.
+const SMALL: [&str; 16] = [
+    "--holdout",
+    "4",
+    "--set",
+    "rays=16",
+    "--set",
+    "hash.levels=4",
+    "--set",
+    "hash.log2_size=10",
+    "--set",
+    "sampling.proposal_samples=16,12",
+    "--set",
+    "sampling.samples=8",
+    "--set",
+    "report.log_steps=2",
+    "--set",
+    "report.preview_steps=4",
+];
+
+#[test]
+fn help_shows_examples_and_exit_codes() {
+    let help = run(&["--help"]);
+    assert_eq!(help.code, Some(0));
+    assert_eq!(help.stderr, "");
+    for code in [
+        "  0  ", "  1  ", "  2  ", "  3  ", "  4  ", "  5  ", "  6  ", "  7  ", "  8  ", "  130  ",
+    ] {
+        assert!(help.stdout.contains(code), "{code} in {}", help.stdout);
+    }
+    for command in [
+        "devices", "inspect", "train", "mesh", "render", "eval", "profile",
+    ] {
+        assert!(
+            help.stdout.contains(&format!("  {command} ")),
+            "{command} in {}",
+            help.stdout
+        );
+        let help = run(&[command, "--help"]);
+        assert_eq!((help.code, help.stderr.as_str()), (Some(0), ""));
+        let shown = help.stdout.split("Example").nth(1).expect("an example");
+        assert!(shown.contains(&format!("neurodin {command}")), "{shown}");
+        assert!(
+            help.stdout.contains("--json"),
+            "global flags are told everywhere"
+        );
+    }
+    let version = run(&["--version"]).stdout;
+    assert!(
+        version.starts_with(concat!("neurodin ", env!("CARGO_PKG_VERSION"))),
+        "{version}"
+    );
+}
+
+#[test]
+fn wrong_usage_exits_2_with_a_hint() {
+    fails(&["trian"], 2, &["'train'"]);
+    fails(&["train", "somewhere"], 2, &["--out"]);
+    fails(&["train", "--out", "x"], 2, &["DATASET"]);
+    fails(
+        &["train", "--out", "x", "--resume", "--radius", "2"],
+        2,
+        &["--radius"],
+    );
+    fails(
+        &["mesh", "run", "--resolution", "many"],
+        2,
+        &["--resolution"],
+    );
+    fails(&["eval"], 2, &["--mesh"]);
+    fails(&["train", "-q", "-v", "x", "--out", "y"], 2, &["--quiet"]);
+    let colored = run(&["--color", "always", "trian"]).stderr;
+    assert!(colored.contains("\x1b["), "{colored}");
+}
+
+#[test]
+fn settings_are_resolved_by_precedence() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("mine.toml");
+    fs::write(
+        &file,
+        "preset = \"indoor-tiny\"\nrays = 100\nseed = 1\nsteps = 7\n",
+    )
+    .unwrap();
+    let file = file.to_str().unwrap();
+    let printed = |command: &mut Command| -> toml::Table {
+        let said = said(command.output().unwrap());
+        assert_eq!((said.code, said.stderr.as_str()), (Some(0), ""));
+        assert!(said.stdout.contains("# "), "settings are explained");
+        said.stdout.parse().unwrap()
+    };
+    let table = printed(
+        neurodin(&[
+            "train",
+            "--print-config",
+            "--config",
+            file,
+            "--set",
+            "rays=50",
+        ])
+        .env("NEURODIN_SEED", "2"),
+    );
+    let number = |name: &str| table[name].as_integer().unwrap();
+    assert_eq!(table["preset"].as_str(), Some("indoor-tiny"));
+    assert_eq!(
+        ["steps", "seed", "rays"].map(number),
+        [7, 2, 50],
+        "file < environment < flags"
+    );
+    let table = printed(
+        neurodin(&[
+            "train",
+            "--print-config",
+            "--preset",
+            "outdoor-large",
+            "--seed",
+            "3",
+        ])
+        .env("NEURODIN_SEED", "2"),
+    );
+    assert_eq!(table["seed"].as_integer(), Some(3));
+    assert_eq!(table["hash"]["features"].as_integer(), Some(8));
+}
+
+#[test]
+fn unusable_settings_exit_3_and_name_the_nearest() {
+    let print = ["train", "--print-config"];
+    let with = |more: &[&str], parts: &[&str]| fails(&[&print[..], more].concat(), 3, parts);
+    with(
+        &["--preset", "outdoor-tinny"],
+        &["'outdoor-tinny'", "'outdoor-tiny'"],
+    );
+    with(
+        &["--set", "hash.log2size=20"],
+        &["'hash.log2size'", "'hash.log2_size'"],
+    );
+    with(
+        &["--set", "hash.levels=few"],
+        &["hash.levels=few", "whole number"],
+    );
+    with(
+        &["--set", "hash.features=3"],
+        &["hash.features = 3", "1, 2, 4 or 8"],
+    );
+    with(&["--steps", "0"], &["steps = 0"]);
+    with(&["--config", "/nowhere/mine.toml"], &["/nowhere/mine.toml"]);
+    let json = fails(
+        &[
+            "train",
+            "--print-config",
+            "--preset",
+            "x",
+            "--log-format",
+            "json",
+        ],
+        3,
+        &["outdoor-tiny"],
+    );
+    let record: Value = serde_json::from_str(json.trim()).expect("one object a line");
+    assert_eq!(
+        (record["level"].as_str(), record["code"].as_i64()),
+        (Some("error"), Some(3))
+    );
+    assert!(record["ts"].is_string() && record["what"].is_string());
+}
+
+#[test]
+fn unusable_inputs_exit_3_and_name_the_file() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name).to_str().unwrap().to_string();
+    let (nowhere, out) = (path("nowhere"), path("run"));
+    fails(
+        &["train", &nowhere, "--out", &out],
+        3,
+        &["nowhere", "next:"],
+    );
+    fails(&["inspect", &nowhere], 3, &["nowhere", "next:"]);
+    fails(
+        &["mesh", &nowhere, "-o", &path("m.ply")],
+        3,
+        &["nowhere", "config.toml", "next:"],
+    );
+    fails(
+        &["render", &nowhere, "--out", &out],
+        3,
+        &["nowhere", "next:"],
+    );
+    fails(&["eval", &nowhere], 3, &["nowhere", "next:"]);
+    fails(
+        &["train", "--out", &nowhere, "--resume"],
+        3,
+        &["nowhere", "next:"],
+    );
+    assert!(!Path::new(&out).exists(), "nothing was begun");
+}
+
+#[test]
+fn outputs_that_exist_exit_8_untouched() {
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path();
+    write_dataset(&root.join("photos"));
+    let photos = root.join("photos").to_str().unwrap().to_string();
+    let occupied = root.join("occupied");
+    fs::create_dir(&occupied).unwrap();
+    fs::write(occupied.join("notes.txt"), "mine").unwrap();
+    let out = occupied.to_str().unwrap();
+    fails(
+        &["train", &photos, "--out", out],
+        8,
+        &["occupied", "not empty", "--force"],
+    );
+    fs::write(occupied.join("config.toml"), "").unwrap();
+    fails(
+        &["train", &photos, "--out", out],
+        8,
+        &["holds a run", "--resume", "--force"],
+    );
+    fails(&["render", out, "--out", out], 8, &["not empty", "--force"]);
+    let notes = occupied.join("notes.txt");
+    fails(
+        &["mesh", out, "-o", notes.to_str().unwrap()],
+        8,
+        &["notes.txt", ".ply"],
+    );
+    fails(
+        &["profile", &photos, "--trace", notes.to_str().unwrap()],
+        8,
+        &["notes.txt", "--force"],
+    );
+    assert_eq!(fs::read_to_string(notes).unwrap(), "mine");
+}
+
+#[test]
+fn no_device_exits_4() {
+    let absent = "/nowhere/icd.json";
+    let said = said(
+        neurodin(&["devices"])
+            .env("VK_DRIVER_FILES", absent)
+            .env("VK_ICD_FILENAMES", absent)
+            .output()
+            .unwrap(),
+    );
+    assert_eq!(
+        (said.code, said.stdout.as_str()),
+        (Some(4), ""),
+        "{}",
+        said.stderr
+    );
+    fails(
+        &["profile", "/nowhere", "--device", "no such device"],
+        3,
+        &["/nowhere"],
+    );
+}
+
+#[test]
+fn devices_are_listed_for_people_and_programs() {
+    let people = run(&["devices", "--color", "never"]);
+    assert_eq!(
+        (people.code, people.stdout.as_str()),
+        (Some(0), ""),
+        "{}",
+        people.stderr
+    );
+    let programs = run(&["devices", "--json", "--quiet"]);
+    assert_eq!((programs.code, programs.stderr.as_str()), (Some(0), ""));
+    let listed: Value = serde_json::from_str(&programs.stdout).unwrap();
+    let first = &listed["devices"][0];
+    assert!(
+        people.stderr.contains(first["name"].as_str().unwrap()),
+        "{}",
+        people.stderr
+    );
+    assert!(first["usable"].is_boolean() && first["memory"].is_u64());
+}
+
+/// Numbers of the log's events of one kind.
+fn logged(run: &Path, event: &str) -> Vec<Value> {
+    fs::read_to_string(run.join("log.jsonl"))
+        .unwrap()
+        .lines()
+        .map(|line| serde_json::from_str::<Value>(line).unwrap())
+        .filter(|record| record["event"] == event)
+        .collect()
+}
+
+/// From photographs to mesh and scores, interrupted and resumed on the way.
+#[test]
+fn a_run_from_photographs_to_mesh() {
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path();
+    write_dataset(&root.join("photos"));
+    let path = |name: &str| root.join(name).to_str().unwrap().to_string();
+    let (photos, out) = (path("photos"), path("run"));
+    let train = |more: &[&str]| {
+        let words = [
+            &["train", &photos, "--out", &out, "--preset", "outdoor-tiny"],
+            &SMALL[..],
+            more,
+        ];
+        neurodin(&words.concat())
+    };
+
+    // A dry run says what it would do, in full, and writes nothing.
+    let dry = said(
+        train(&["--steps", "12", "--dry-run", "--json"])
+            .output()
+            .unwrap(),
+    );
+    assert_eq!(dry.code, Some(0), "{}", dry.stderr);
+    let result: Value = serde_json::from_str(&dry.stdout).unwrap();
+    assert_eq!(result["config"]["steps"], 12);
+    assert!(!root.join("run").exists());
+
+    let whole = said(
+        train(&["--steps", "12", "--json", "--quiet"])
+            .output()
+            .unwrap(),
+    );
+    assert_eq!((whole.code, whole.stderr.as_str()), (Some(0), ""));
+    let result: Value = serde_json::from_str(&whole.stdout).unwrap();
+    assert_eq!(result["step"], 12);
+    let run_folder = root.join("run");
+    for file in [
+        "config.toml",
+        "scene.json",
+        "log.jsonl",
+        "previews/step-00000004.png",
+        "ckpt/step-00000012.safetensors",
+    ] {
+        assert!(run_folder.join(file).is_file(), "{file}");
+    }
+    let steps = logged(&run_folder, "step");
+    assert!(steps.len() >= 5, "{steps:?}");
+    assert!(
+        steps
+            .iter()
+            .all(|record| record["loss.total"].is_f64() && record["psnr"].is_f64())
+    );
+    assert_eq!(logged(&run_folder, "finished").len(), 1);
+
+    // Longer by --resume; a setting that does not fit is refused by name, one that changes the course is told.
+    let refused = fails(
+        &["train", "--out", &out, "--resume", "--set", "hash.levels=5"],
+        3,
+        &["hash.levels: 4 -> 5", "next:"],
+    );
+    assert!(!refused.contains("panic"), "{refused}");
+    let longer = run(&["train", "--out", &out, "--resume", "--steps", "16"]);
+    assert_eq!(longer.code, Some(0), "{}", longer.stderr);
+    assert!(
+        longer.stderr.contains("steps: 12 -> 16"),
+        "{}",
+        longer.stderr
+    );
+    assert_eq!(logged(&run_folder, "resumed")[0]["step"], 12);
+
+    // A damaged checkpoint is refused, and the one before taken.
+    let newest = run_folder.join("ckpt/step-00000016.safetensors");
+    let mut bytes = fs::read(&newest).unwrap();
+    let middle = bytes.len() / 2;
+    bytes[middle] ^= 1;
+    fs::write(&newest, bytes).unwrap();
+    let meshed = run(&["mesh", &out, "--resolution", "24", "--json"]);
+    assert!(
+        meshed.stderr.contains("step-00000016") && meshed.stderr.contains("damaged"),
+        "{}",
+        meshed.stderr
+    );
+    assert_eq!(meshed.code, Some(0), "{}", meshed.stderr);
+    let result: Value = serde_json::from_str(&meshed.stdout).unwrap();
+    assert_eq!(result["step"], 12);
+    assert!(result["faces"].as_u64().unwrap() > 100, "{result}");
+    fails(
+        &["mesh", &out, "--resolution", "24"],
+        8,
+        &["mesh.ply", "exists"],
+    );
+
+    let pictures = path("pictures");
+    let rendered = run(&[
+        "render",
+        &out,
+        "--out",
+        &pictures,
+        "--what",
+        "rgb,depth,normal",
+        "--json",
+    ]);
+    assert_eq!(rendered.code, Some(0), "{}", rendered.stderr);
+    let result: Value = serde_json::from_str(&rendered.stdout).unwrap();
+    let files = result["files"].as_array().unwrap();
+    assert_eq!(files.len(), 5 * result["views"].as_array().unwrap().len());
+    assert!(
+        files
+            .iter()
+            .all(|file| Path::new(file.as_str().unwrap()).is_file())
+    );
+    assert_eq!(image::open(files[0].as_str().unwrap()).unwrap().width(), 24);
+
+    let scored = run(&["eval", &out, "--json"]);
+    assert_eq!(scored.code, Some(0), "{}", scored.stderr);
+    let result: Value = serde_json::from_str(&scored.stdout).unwrap();
+    let psnr = result["psnr"].as_f64().unwrap();
+    assert!((3.0..60.0).contains(&psnr), "{result}");
+
+    let trace = path("trace.json");
+    let words = [
+        &[
+            "profile",
+            &photos,
+            "--preset",
+            "outdoor-tiny",
+            "--steps",
+            "3",
+            "--warmup",
+            "1",
+            "--json",
+            "--trace",
+            &trace,
+        ],
+        &SMALL[..],
+    ];
+    let profiled = run(&words.concat());
+    assert_eq!(profiled.code, Some(0), "{}", profiled.stderr);
+    let result: Value = serde_json::from_str(&profiled.stdout).unwrap();
+    assert!(result["rows"].as_array().unwrap().len() > 10, "{result}");
+    assert!(result["rows"][0]["launches"].as_u64().unwrap() >= 3);
+    let trace: Value = serde_json::from_str(&fs::read_to_string(trace).unwrap()).unwrap();
+    assert!(trace["traceEvents"].as_array().unwrap().len() > 30);
+}
+
+/// The first interrupt saves and exits 130, and the run goes on from exactly there.
+#[test]
+#[cfg(unix)]
+fn an_interrupted_run_is_saved_and_goes_on() {
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path();
+    write_dataset(&root.join("photos"));
+    let path = |name: &str| root.join(name).to_str().unwrap().to_string();
+    let (photos, out) = (path("photos"), path("run"));
+    let words = [
+        &[
+            "train",
+            &photos,
+            "--out",
+            &out,
+            "--preset",
+            "outdoor-tiny",
+            "--steps",
+            "1000000",
+        ],
+        &SMALL[..],
+    ];
+    let child = neurodin(&words.concat())
+        .stderr(Stdio::piped())
+        .stdout(Stdio::null())
+        .spawn()
+        .unwrap();
+    let log = root.join("run/log.jsonl");
+    let deadline = Instant::now() + Duration::from_secs(120);
+    while !fs::read_to_string(&log).is_ok_and(|text| text.contains("\"step\",\"step\":")) {
+        assert!(Instant::now() < deadline, "it never trained");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    let killed = Command::new("kill")
+        .args(["-INT", &child.id().to_string()])
+        .status()
+        .unwrap();
+    assert!(killed.success());
+    let stopped = said(child.wait_with_output().unwrap());
+    assert_eq!(stopped.code, Some(130), "{}", stopped.stderr);
+    assert!(stopped.stderr.contains("--resume"), "{}", stopped.stderr);
+    let saved = logged(&root.join("run"), "saved")
+        .pop()
+        .expect("a checkpoint");
+    let step = saved["step"].as_u64().unwrap();
+    assert!(Path::new(saved["path"].as_str().unwrap()).is_file());
+    let resumed = run(&[
+        "train",
+        "--out",
+        &out,
+        "--resume",
+        "--steps",
+        &(step + 2).to_string(),
+    ]);
+    assert_eq!(resumed.code, Some(0), "{}", resumed.stderr);
+    assert_eq!(logged(&root.join("run"), "resumed")[0]["step"], step);
+    let finished = logged(&root.join("run"), "finished").pop().unwrap();
+    assert_eq!(finished["step"], step + 2);
+}
