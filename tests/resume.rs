@@ -1,0 +1,120 @@
+//! Going on from a checkpoint is going on: the same state, and the same next step.
+
+use glam::{DMat4, DVec3};
+use neurodin::config::Config;
+use neurodin::gpu::{Gpu, GpuOptions};
+use neurodin::scene::{Region, RegionShape, Scene, SceneOptions};
+use neurodin::train::Trainer;
+use neurodin::train::checkpoint::Checkpoint;
+use std::fs;
+use std::path::Path;
+
+/// Nine pictures of coloured noise from a ring of cameras.
+fn scene(folder: &Path) -> Scene {
+    let mut frames = Vec::new();
+    for view in 0..9u32 {
+        let turned = DMat4::from_rotation_y(f64::from(view) * 0.7);
+        let pose = turned * DMat4::from_translation(DVec3::new(0.0, 0.0, 3.0));
+        let rows: Vec<[f64; 4]> = (0..4).map(|row| pose.row(row).to_array()).collect();
+        let name = format!("view{view}.png");
+        image::RgbImage::from_fn(20, 16, |x, y| {
+            image::Rgb([7, 11, 13].map(|prime| ((x * prime + y * 5 + view * 29) % 256) as u8))
+        })
+        .save(folder.join(&name))
+        .unwrap();
+        frames.push(serde_json::json!({ "file_path": name, "transform_matrix": rows }));
+    }
+    let transforms = serde_json::json!({
+        "w": 20, "h": 16, "fl_x": 18.0, "fl_y": 18.0, "cx": 10.0, "cy": 8.0,
+        "sphere_center": [0.0, 0.0, 0.0], "sphere_radius": 1.0, "frames": frames,
+    });
+    fs::write(folder.join("transforms.json"), transforms.to_string()).unwrap();
+    Scene::open(folder, &SceneOptions::default()).unwrap()
+}
+
+#[test]
+fn a_restored_run_takes_the_same_next_step() {
+    let folder = tempfile::tempdir().unwrap();
+    let scene = scene(folder.path());
+    let region = Region {
+        center: DVec3::ZERO,
+        radius: 1.1,
+        shape: RegionShape::Sphere,
+        how: "stated".into(),
+    };
+    // Every kind of parameter there is: codes, a background field, both proposals.
+    let config = Config::preset("outdoor-tiny")
+        .and_then(|config| {
+            config.with_toml(
+                "steps = 40\nrays = 32\nappearance.dims = 8\nbackground.kind = 'field'\nbackground.samples = 8\nhash.levels = 4\nhash.log2_size = 10",
+                "test",
+            )
+        })
+        .and_then(Config::validated)
+        .unwrap();
+    let gpu = Gpu::new(&GpuOptions::default()).unwrap();
+    let mut first = Trainer::new(&gpu, &scene, &region, &config).unwrap();
+    for _ in 0..6 {
+        first.step().unwrap();
+    }
+    let saved = first.save(&folder.path().join("first")).unwrap();
+    let begun_anew = Checkpoint::open(&saved).unwrap();
+    let moved = |name: &str| begun_anew.tensor(name).unwrap().1.iter().any(|x| *x != 0.0);
+    assert!(
+        moved("second_moment.surface.table") && moved("first_moment.appearance"),
+        "it has trained"
+    );
+
+    let mut second = Trainer::new(&gpu, &scene, &region, &config).unwrap();
+    second.restore(&begun_anew).unwrap();
+    assert_eq!(second.steps_done(), 6);
+    let again = second.save(&folder.path().join("second")).unwrap();
+    assert!(
+        fs::read(&saved).unwrap() == fs::read(&again).unwrap(),
+        "saved, restored, saved: the same bytes"
+    );
+
+    // Losses are summed in a fixed order, so the next step's are equal to the last bit; after it, gradients meet in any order.
+    first.step().unwrap();
+    second.step().unwrap();
+    let (first, second) = (
+        first.finish().unwrap().unwrap(),
+        second.finish().unwrap().unwrap(),
+    );
+    assert_eq!((first.step, second.step), (6, 6));
+    assert_eq!(first.values, second.values);
+    assert!(
+        first.values.iter().all(|value| value.is_finite()),
+        "{first:?}"
+    );
+}
+
+#[test]
+fn a_checkpoint_of_another_region_or_model_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let scene = scene(folder.path());
+    let config = Config::preset("outdoor-tiny")
+        .and_then(|config| config.with_toml("rays = 16\nhash.log2_size = 10", "test"))
+        .unwrap();
+    let region = |radius: f64| Region {
+        center: DVec3::ZERO,
+        radius,
+        shape: RegionShape::Sphere,
+        how: "stated".into(),
+    };
+    let gpu = Gpu::new(&GpuOptions::default()).unwrap();
+    let saved = Trainer::new(&gpu, &scene, &region(1.0), &config)
+        .and_then(|trainer| trainer.save(folder.path()))
+        .unwrap();
+    let checkpoint = Checkpoint::open(&saved).unwrap();
+    let refusal = |radius: f64, setting: &str| {
+        let config = config.clone().with_assignment(setting).unwrap();
+        let mut other = Trainer::new(&gpu, &scene, &region(radius), &config).unwrap();
+        let error = other.restore(&checkpoint).unwrap_err();
+        assert_eq!(error.exit_code(), 3);
+        error.to_string()
+    };
+    assert!(refusal(2.0, "rays=16").contains("another region"));
+    let other_model = refusal(1.0, "hash.log2_size=11");
+    assert!(other_model.contains("surface.table"), "{other_model}");
+}
