@@ -324,8 +324,10 @@ impl Task {
             failed,
             psnr,
             checkpoint,
+            progress,
             ..
         } = teller;
+        drop(progress);
         if let Some(error) = failed {
             return Err(error.into());
         }
