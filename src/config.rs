@@ -273,6 +273,8 @@ pub struct ReportConfig {
     pub preview_pixels: u64,
     /// Between two checkpoints; 0 for one at the end (and on interruption) only.
     pub checkpoint_steps: u64,
+    /// One more when this many minutes have passed since the last; 0 for none.
+    pub checkpoint_minutes: f64,
     /// Complete checkpoints that stay in the run directory.
     pub keep: u32,
 }

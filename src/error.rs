@@ -62,6 +62,19 @@ impl Error {
         }
     }
 
+    /// An output that cannot be made, with what to do about it.
+    pub fn output(
+        path: impl AsRef<Path>,
+        what: impl Into<String>,
+        next: impl Into<String>,
+    ) -> Self {
+        Error::Output {
+            path: path.as_ref().to_path_buf(),
+            what: what.into(),
+            next: next.into(),
+        }
+    }
+
     /// A failed file operation on `path`.
     pub fn io(path: impl AsRef<Path>, source: std::io::Error) -> Self {
         Error::Io {

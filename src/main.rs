@@ -1,1 +1,5 @@
-fn main() {}
+//! The program `neurodin`; everything is in [`neurodin::cli`].
+
+fn main() -> std::process::ExitCode {
+    neurodin::cli::main()
+}

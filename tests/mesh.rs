@@ -5,9 +5,8 @@ use std::collections::HashMap;
 
 use glam::{DMat4, DQuat, DVec3};
 use neurodin::mesh::extract::{PointAttributes, extract_surface, to_world};
-use neurodin::mesh::{
-    Domain, ExtractOptions, Lattice, Mesh, SurfaceAttributes, clean, extract_mesh,
-};
+use neurodin::mesh::{ExtractOptions, Lattice, Mesh, SurfaceAttributes, clean, extract_mesh};
+use neurodin::scene::RegionShape;
 use neurodin::{Error, Result};
 use proptest::prelude::*;
 
@@ -181,7 +180,7 @@ fn torus_has_one_hole() {
     assert_eq!(assert_closed_manifold(&mesh), 0);
 }
 
-/// Values drawn per lattice point: every ambiguous case, many times over. Positive on the domain's border, so the surface is closed.
+/// Values drawn per lattice point: every ambiguous case, many times over. Positive on the shape's border, so the surface is closed.
 fn noise(seed: u64, p: DVec3, cell: f64, levels: f64) -> f64 {
     let index = (p / cell).round();
     if index.abs().max_element() >= 5.0 {
@@ -207,7 +206,7 @@ proptest! {
     #[test]
     fn noise_is_closed_and_manifold(seed: u64, levels in prop_oneof![Just(0.0), Just(2.0), Just(3.0), Just(5.0)], block in 2usize..14) {
         let half = DVec3::splat(1.0);
-        let options = ExtractOptions { resolution: 12, block, domain: Domain::Box { half }, ..Default::default() };
+        let options = ExtractOptions { resolution: 12, block, shape: RegionShape::Box { half }, ..Default::default() };
         let cell = extract_surface(&mut Analytic(|_| 1.0), &options, &mut |_| true).unwrap().1.step;
         let mesh = extract(|p| noise(seed, p, cell, levels), &options);
         prop_assert!(mesh.faces.len() > 1000, "{} faces", mesh.faces.len());
@@ -319,7 +318,7 @@ fn nothing_is_left_outside_of_the_region() {
     let half = DVec3::new(1.0, 0.5, 0.7);
     let options = ExtractOptions {
         resolution: 50,
-        domain: Domain::Box { half },
+        shape: RegionShape::Box { half },
         ..Default::default()
     };
     let mesh = extract(slab, &options);
@@ -461,15 +460,15 @@ impl Lattice for ExactPoints {
 #[test]
 fn lattice_points_are_exact_in_float32() {
     for resolution in [2, 3, 50, 97, 333, 500, 512, 513] {
-        for domain in [
-            Domain::Sphere,
-            Domain::Box {
+        for shape in [
+            RegionShape::Sphere,
+            RegionShape::Box {
                 half: DVec3::new(0.3, 1.0, 0.77),
             },
         ] {
             let options = ExtractOptions {
                 resolution,
-                domain,
+                shape,
                 ..Default::default()
             };
             let (mesh, stats) = extract_surface(&mut ExactPoints, &options, &mut |_| true).unwrap();
@@ -520,13 +519,13 @@ fn damaged_fields_and_senseless_options_are_refused() {
             ..options.clone()
         },
         ExtractOptions {
-            domain: Domain::Box {
+            shape: RegionShape::Box {
                 half: DVec3::new(1.0, 0.0, 1.0),
             },
             ..options.clone()
         },
         ExtractOptions {
-            domain: Domain::Box {
+            shape: RegionShape::Box {
                 half: DVec3::new(1.0, f64::NAN, 1.0),
             },
             ..options.clone()

@@ -7,6 +7,7 @@ use std::path::PathBuf;
 use clap::Args;
 use serde_json::{Value, json};
 
+use super::Context;
 use super::scene_args::SceneArgs;
 use crate::Error;
 use crate::scene::{
@@ -28,15 +29,12 @@ pub struct InspectArgs {
     /// Replace the preview if it exists
     #[arg(long)]
     pub force: bool,
-    /// Print the report as JSON
-    #[arg(long)]
-    pub json: bool,
     #[command(flatten)]
     pub scene: SceneArgs,
 }
 
-/// Opens the dataset, prints the report on stdout and writes the preview.
-pub fn run(args: &InspectArgs) -> anyhow::Result<()> {
+/// Opens the dataset, reports on it and writes the preview.
+pub(super) fn run(args: &InspectArgs, context: &Context) -> anyhow::Result<()> {
     if let Some(preview) = args
         .preview
         .as_ref()
@@ -56,14 +54,8 @@ pub fn run(args: &InspectArgs) -> anyhow::Result<()> {
         write_preview(&scene, &region, preview)?;
     }
     let report = report(&scene, &looks, &region, args.preview.as_ref());
-    if args.json {
-        println!("{}", serde_json::to_string_pretty(&report)?);
-    } else {
-        print!(
-            "{}",
-            as_text(&scene, &looks, &region, args.preview.as_ref())
-        );
-    }
+    let text = as_text(&scene, &looks, &region, args.preview.as_ref());
+    context.result(&report, &text)?;
     Ok(())
 }
 

@@ -63,7 +63,7 @@ impl SceneArgs {
 }
 
 /// `N` numbers with commas between them.
-fn numbers<const N: usize>(text: &str) -> Result<[f64; N], String> {
+pub(super) fn numbers<const N: usize>(text: &str) -> Result<[f64; N], String> {
     let parts: Vec<&str> = text.split(',').map(str::trim).collect();
     let wanted = || format!("{N} numbers with commas between them, not {}", parts.len());
     if parts.len() != N {

@@ -84,22 +84,26 @@ impl Config {
     /// # Errors
     /// [`Error::Config`] for text that is not TOML, unknown keys and presets, and values of the wrong type or out of range.
     pub fn from_toml(text: &str, source: &str) -> Result<Config> {
-        Config::default_preset_of(text, source)?
-            .with_toml(text, source)?
-            .validated()
+        Config::from_toml_or(text, source, Config::default())?.validated()
     }
 
-    /// The preset that a TOML text starts from.
-    fn default_preset_of(text: &str, source: &str) -> Result<Config> {
-        match parse(text, source)?.get("preset") {
-            None => Ok(Config::default()),
-            Some(Value::String(name)) => Config::preset(name),
-            Some(other) => Err(Error::Config {
-                what: format!(
-                    "{source}: preset = {other}: expected the name of a preset in quotes"
-                ),
-            }),
-        }
+    /// As [`Config::from_toml`], but a text without the key `preset` differs from `base`; ranges are not checked yet.
+    ///
+    /// # Errors
+    /// As [`Config::from_toml`].
+    pub fn from_toml_or(text: &str, source: &str, base: Config) -> Result<Config> {
+        let base = match parse(text, source)?.get("preset") {
+            None => base,
+            Some(Value::String(name)) => Config::preset(name)?,
+            Some(other) => {
+                return Err(Error::Config {
+                    what: format!(
+                        "{source}: preset = {other}: expected the name of a preset in quotes"
+                    ),
+                });
+            }
+        };
+        base.with_toml(text, source)
     }
 
     /// This configuration with a partial TOML text laid over it; ranges are not checked yet.

@@ -132,6 +132,12 @@ impl Config {
             16,
             u64::MAX,
         );
+        wrong.real(
+            "report.checkpoint_minutes",
+            self.report.checkpoint_minutes,
+            0.0,
+            1e6,
+        );
         wrong.whole("report.keep", self.report.keep, 1, 1_000_000);
 
         match wrong.0.is_empty() {

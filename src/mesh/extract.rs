@@ -12,6 +12,7 @@ use glam::{DMat3, DMat4, DVec3};
 
 use super::Mesh;
 use super::marching_cubes::{MAX_VERTICES, Marcher, OUTSIDE, Sink};
+use crate::scene::{Region, RegionShape};
 use crate::{Error, Result};
 
 /// Signed distances on a regular lattice, in the region frame; positive in free space.
@@ -36,39 +37,6 @@ pub trait SurfaceAttributes {
 /// Colours and gradients, one of each per point.
 pub type PointAttributes = (Vec<[f32; 3]>, Vec<[f32; 3]>);
 
-/// The part of the region frame that may hold surface. Faces with a vertex outside are left out.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Domain {
-    /// ‖x‖ ≤ 1
-    Sphere,
-    /// |x_j| ≤ half_j
-    Box { half: DVec3 },
-}
-
-impl Domain {
-    fn half(&self) -> DVec3 {
-        match *self {
-            Domain::Sphere => DVec3::ONE,
-            Domain::Box { half } => half,
-        }
-    }
-
-    fn contains(&self, p: DVec3) -> bool {
-        match *self {
-            Domain::Sphere => p.length_squared() <= 1.0,
-            Domain::Box { half } => p.abs().cmple(half).all(),
-        }
-    }
-
-    /// Whether a box has a point in common with the domain.
-    fn meets(&self, low: DVec3, high: DVec3) -> bool {
-        match *self {
-            Domain::Sphere => DVec3::ZERO.clamp(low, high).length_squared() <= 1.0,
-            Domain::Box { half } => low.cmple(half).all() && high.cmpge(-half).all(),
-        }
-    }
-}
-
 /// How to extract.
 #[derive(Clone, Debug)]
 pub struct ExtractOptions {
@@ -76,7 +44,8 @@ pub struct ExtractOptions {
     pub resolution: u32,
     /// Cells along the side of a block. The mesh does not depend on it; scratch memory and device efficiency do.
     pub block: usize,
-    pub domain: Domain,
+    /// Faces with a vertex outside of it are left out.
+    pub shape: RegionShape,
     /// Similarity that takes the mesh to the input's world.
     pub world_from_region: DMat4,
     /// World-axis box outside which nothing is wanted; blocks beyond it are not evaluated.
@@ -91,10 +60,21 @@ impl Default for ExtractOptions {
         ExtractOptions {
             resolution: 512,
             block: 64,
-            domain: Domain::Sphere,
+            shape: RegionShape::Sphere,
             world_from_region: DMat4::IDENTITY,
             crop: None,
             steepest: None,
+        }
+    }
+}
+
+impl ExtractOptions {
+    /// The defaults for a region: all of it, in the world's coordinates.
+    pub fn of(region: &Region) -> ExtractOptions {
+        ExtractOptions {
+            shape: region.shape,
+            world_from_region: region.world_from_region(),
+            ..Default::default()
         }
     }
 }
@@ -126,7 +106,7 @@ pub struct ExtractStats {
     pub cells: [usize; 3],
     pub step: f64,
     pub blocks: u64,
-    /// Blocks left out because they are outside the domain or crop box, and because of [`ExtractOptions::steepest`].
+    /// Blocks left out because they are outside the region or crop box, and because of [`ExtractOptions::steepest`].
     pub blocks_outside: u64,
     pub blocks_skipped: u64,
     /// Largest slope seen between neighbouring lattice points of the evaluated blocks (only where `steepest` was given).
@@ -185,7 +165,7 @@ pub fn extract_surface(
                 let last: [usize; 3] =
                     std::array::from_fn(|j| (first[j] + options.block).min(grid.cells[j]));
                 let (low, high) = (grid.at(first), grid.at(last));
-                if !options.domain.meets(low, high) || !sink.crop_meets(low, high) {
+                if !meets(options.shape, low, high) || !sink.crop_meets(low, high) {
                     stats.blocks_outside += 1;
                 } else if let Some(steepest) = options.steepest
                     && is_far_from_zero(field, low, high, steepest, &mut values)?
@@ -339,6 +319,29 @@ fn not_finite(
     }
 }
 
+fn half_extents(shape: RegionShape) -> DVec3 {
+    match shape {
+        RegionShape::Sphere => DVec3::ONE,
+        RegionShape::Box { half } => half,
+    }
+}
+
+/// Whether a point of the region frame belongs to the region.
+fn contains(shape: RegionShape, p: DVec3) -> bool {
+    match shape {
+        RegionShape::Sphere => p.length_squared() <= 1.0,
+        RegionShape::Box { half } => p.abs().cmple(half).all(),
+    }
+}
+
+/// Whether a box of the region frame has a point in common with the region.
+fn meets(shape: RegionShape, low: DVec3, high: DVec3) -> bool {
+    match shape {
+        RegionShape::Sphere => DVec3::ZERO.clamp(low, high).length_squared() <= 1.0,
+        RegionShape::Box { half } => low.cmple(half).all() && high.cmpge(-half).all(),
+    }
+}
+
 /// Whether no point between `low` and `high` can be zero if the field's slope is at most `steepest`: true if at the centre of each of
 /// `PROBES`³ sub-blocks the value is larger than what the way to its corner can undo.
 fn is_far_from_zero(
@@ -389,7 +392,7 @@ struct Grid {
 
 impl Grid {
     fn new(options: &ExtractOptions) -> Result<Grid> {
-        let half = options.domain.half();
+        let half = half_extents(options.shape);
         let config = |what: String| Err(Error::Config { what });
         if !(half.is_finite() && half.min_element() > 0.0) {
             return config(format!("the region's half extents {half} must be positive"));
@@ -501,7 +504,7 @@ impl<'a> BlockSink<'a> {
                 .crop
                 .is_some_and(|[low, high]| world.cmplt(low).any() || world.cmpgt(high).any())
         };
-        if !self.options.domain.contains(position)
+        if !contains(self.options.shape, position)
             || cropped()
             || self.mesh.positions.len() >= MAX_VERTICES
         {

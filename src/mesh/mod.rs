@@ -15,7 +15,7 @@ pub mod write;
 use glam::DVec3;
 
 pub use extract::{
-    Domain, ExtractOptions, ExtractStats, Lattice, Progress, SurfaceAttributes, extract_mesh,
+    ExtractOptions, ExtractStats, Lattice, Progress, SurfaceAttributes, extract_mesh,
 };
 pub use field::Field;
 pub use read::read_mesh;

@@ -9,6 +9,7 @@ use glam::{DMat4, DVec2, DVec3};
 use rayon::prelude::*;
 
 use super::Mesh;
+use crate::scene::View;
 
 /// A camera as far as seeing is concerned.
 pub trait Viewpoint: Sync {
@@ -20,6 +21,20 @@ pub trait Viewpoint: Sync {
     fn project(&self, p_camera: DVec3) -> Option<DVec2>;
 }
 
+impl Viewpoint for View {
+    fn world_from_camera(&self) -> DMat4 {
+        self.world_from_camera
+    }
+
+    fn size(&self) -> [u32; 2] {
+        [self.camera.width, self.camera.height]
+    }
+
+    fn project(&self, p_camera: DVec3) -> Option<DVec2> {
+        self.camera.project(p_camera)
+    }
+}
+
 /// How visibility is decided.
 #[derive(Clone, Copy, Debug)]
 pub struct VisibilityOptions {
@@ -27,7 +42,7 @@ pub struct VisibilityOptions {
     pub min_views: u32,
     /// A point is hidden only by what is nearer by more than this fraction of its distance.
     pub slack: f64,
-    /// Depth map pixels along an image pixel, halved by 0.5.
+    /// Pixels of the depth map along one of the picture.
     pub scale: f64,
 }
 
@@ -41,7 +56,7 @@ impl Default for VisibilityOptions {
     }
 }
 
-/// For each face, whether at least `min_views` of the views see its centre or one of its corners.
+/// For each face, whether at least `min_views` of the views show it in a pixel, or see its centre or one of its corners.
 pub fn seen_faces<V: Viewpoint>(
     mesh: &Mesh,
     views: &[V],
@@ -50,12 +65,18 @@ pub fn seen_faces<V: Viewpoint>(
     let n_seeing: Vec<AtomicU32> = mesh.faces.iter().map(|_| AtomicU32::new(0)).collect();
     views.par_iter().for_each(|view| {
         let depth = DepthMap::new(mesh, view, options.scale);
+        let mut shown = vec![false; mesh.faces.len()];
+        for &(distance, face) in &depth.nearest {
+            if distance.is_finite() {
+                shown[face as usize] = true;
+            }
+        }
         for (face, n_seeing) in n_seeing.iter().enumerate() {
             if n_seeing.load(Relaxed) < options.min_views {
                 let [a, b, c] = mesh.corners(face);
-                let seen = [(a + b + c) / 3.0, a, b, c]
-                    .into_iter()
-                    .any(|p| depth.sees(p, options.slack));
+                // Faces between pixel centres are asked at a few points.
+                let mut points = [(a + b + c) / 3.0, a, b, c].into_iter();
+                let seen = shown[face] || points.any(|p| depth.sees(p, options.slack));
                 n_seeing.fetch_add(u32::from(seen), Relaxed);
             }
         }
@@ -68,6 +89,8 @@ pub fn seen_faces<V: Viewpoint>(
 
 /// Longest side, in pixels, of the triangles that are filled by linear interpolation.
 const SMALL: f64 = 6.0;
+/// Triangles are drawn larger by this share, so that no light falls between neighbours that were cut or rounded differently.
+const OVERLAP: f64 = 0.01;
 /// Triangles are halved at most so often along each side.
 const MAX_CUTS: u32 = 10;
 
@@ -78,8 +101,8 @@ pub struct DepthMap<'a, V: Viewpoint> {
     scale: f64,
     width: usize,
     height: usize,
-    /// `[height, width]` infinite where there is nothing
-    depth: Vec<f32>,
+    /// `[height, width]` distance and face; infinite where there is nothing
+    nearest: Vec<(f32, u32)>,
 }
 
 impl<'a, V: Viewpoint> DepthMap<'a, V> {
@@ -89,22 +112,26 @@ impl<'a, V: Viewpoint> DepthMap<'a, V> {
             .size()
             .map(|n| ((f64::from(n) * scale).ceil() as usize).max(1));
         let camera_from_world = view.world_from_camera().inverse();
-        let depth = vec![f32::INFINITY; width * height];
+        let nearest = vec![(f32::INFINITY, u32::MAX); width * height];
         let mut map = DepthMap {
             view,
             camera_from_world,
             scale,
             width,
             height,
-            depth,
+            nearest,
         };
         let corners: Vec<Corner> = mesh
             .positions
             .iter()
             .map(|&p| map.corner(map.camera_from_world.transform_point3(p)))
             .collect();
-        for face in &mesh.faces {
-            map.draw(face.map(|vertex| corners[vertex as usize]), MAX_CUTS);
+        for (face, vertices) in mesh.faces.iter().enumerate() {
+            map.draw(
+                face as u32,
+                vertices.map(|vertex| corners[vertex as usize]),
+                MAX_CUTS,
+            );
         }
         map
     }
@@ -121,14 +148,23 @@ impl<'a, V: Viewpoint> DepthMap<'a, V> {
         {
             return false;
         }
-        // On a slanted surface the four pixel centres around a point lie before and behind it: compare with the farthest.
-        let around =
-            |x: f64, n: usize| [(x - 0.5).max(0.0) as usize, ((x + 0.5) as usize).min(n - 1)];
-        let farthest = around(pixel.y, self.height)
-            .into_iter()
-            .flat_map(|y| around(pixel.x, self.width).map(|x| self.depth[y * self.width + x]))
-            .fold(0.0, f32::max);
-        corner.p.length() * (1.0 - slack) <= f64::from(farthest)
+        let (x, y) = (pixel.x as usize, pixel.y as usize);
+        let at = |x: usize, y: usize| f64::from(self.nearest[y * self.width + x].0);
+        let here = at(x, y);
+        // Within a pixel a slanted surface gets this much farther along one axis; beside an edge, the flatter side counts.
+        let rise = |before: f64, after: f64| {
+            let slope = (here - before).abs().min((here - after).abs());
+            if slope.is_finite() { 0.5 * slope } else { 0.0 }
+        };
+        let along_x = rise(
+            at(x.saturating_sub(1), y),
+            at((x + 1).min(self.width - 1), y),
+        );
+        let along_y = rise(
+            at(x, y.saturating_sub(1)),
+            at(x, (y + 1).min(self.height - 1)),
+        );
+        corner.p.length() * (1.0 - slack) <= here + along_x + along_y
     }
 
     fn corner(&self, p: DVec3) -> Corner {
@@ -141,7 +177,7 @@ impl<'a, V: Viewpoint> DepthMap<'a, V> {
     }
 
     /// Draws a triangle, in pieces where it is large or partly outside of what the lens can show.
-    fn draw(&mut self, corners: [Corner; 3], cuts: u32) {
+    fn draw(&mut self, face: u32, corners: [Corner; 3], cuts: u32) {
         let pixels = corners.map(|corner| corner.pixel);
         let whole = if let [Some(a), Some(b), Some(c)] = pixels {
             let (low, high) = (a.min(b).min(c), a.max(b).max(c));
@@ -152,7 +188,7 @@ impl<'a, V: Viewpoint> DepthMap<'a, V> {
                 return;
             }
             if (high - low).max_element() <= SMALL || cuts == 0 {
-                return self.fill([a, b, c], corners.map(|corner| corner.p.length()));
+                return self.fill(face, [a, b, c], corners.map(|corner| corner.p.length()));
             }
             true
         } else {
@@ -167,12 +203,12 @@ impl<'a, V: Viewpoint> DepthMap<'a, V> {
                 [(a + b) / 2.0, (b + c) / 2.0, (c + a) / 2.0].map(|p| self.corner(p));
             let [a, b, c] = corners;
             for piece in [[a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca]] {
-                self.draw(piece, cuts - 1);
+                self.draw(face, piece, cuts - 1);
             }
         }
     }
 
-    fn fill(&mut self, [a, b, c]: [DVec2; 3], depths: [f64; 3]) {
+    fn fill(&mut self, face: u32, [a, b, c]: [DVec2; 3], depths: [f64; 3]) {
         let area = (b - a).perp_dot(c - a);
         if area == 0.0 {
             return;
@@ -188,10 +224,12 @@ impl<'a, V: Viewpoint> DepthMap<'a, V> {
                     (a - c).perp_dot(p - c) / area,
                     (b - a).perp_dot(p - a) / area,
                 ];
-                if weights.iter().all(|&w| w >= 0.0) {
+                if weights.iter().all(|&w| w >= -OVERLAP) {
                     let depth = (0..3).map(|i| weights[i] * depths[i]).sum::<f64>() as f32;
-                    let nearest = &mut self.depth[y * self.width + x];
-                    *nearest = nearest.min(depth);
+                    let nearest = &mut self.nearest[y * self.width + x];
+                    if depth < nearest.0 {
+                        *nearest = (depth, face);
+                    }
                 }
             }
         }

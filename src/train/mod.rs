@@ -1,7 +1,12 @@
 //! Optimiser steps, their schedules, what is saved of them and what is told about them.
 
 mod adam;
+pub mod checkpoint;
+pub mod report;
+mod run;
+pub mod run_directory;
 pub mod schedule;
+pub mod trained;
 
 use glam::DMat4;
 
@@ -28,6 +33,8 @@ pub struct Trainer {
     views: ViewTable,
     /// Indices into the scene's views in the order of the device's table: training views, then held-out ones.
     view_order: Vec<usize>,
+    /// What a preview shows; the last row of the device's table.
+    preview: Option<run::PreviewView>,
     step: u64,
     /// Losses of the last steps, [LOSS_HISTORY, TERMS + 1], read without waiting.
     history: Readback<f32>,
@@ -52,7 +59,8 @@ impl Trainer {
     pub fn new(gpu: &Gpu, scene: &Scene, region: &Region, config: &Config) -> Result<Trainer> {
         let training: Vec<usize> = scene.split(Split::Train).collect();
         let held_out: Vec<usize> = scene.split(Split::Test).collect();
-        let others: Vec<(Camera, DMat4)> = held_out
+        let preview = run::PreviewView::choose(scene, config);
+        let mut others: Vec<(Camera, DMat4)> = held_out
             .iter()
             .map(|&v| {
                 (
@@ -61,6 +69,11 @@ impl Trainer {
                 )
             })
             .collect();
+        others.extend(
+            preview
+                .iter()
+                .map(|preview| (preview.camera.clone(), preview.world_from_camera)),
+        );
         let pictures = training.iter().map(|&v| {
             let view = &scene.views[v];
             Ok((
@@ -111,6 +124,7 @@ impl Trainer {
             gpu: gpu.clone(),
             config: config.clone(),
             region: region.clone(),
+            preview,
             step: 0,
             model,
             renderer,
@@ -253,6 +267,17 @@ impl Trainer {
             _ => n_training,
         };
         let _ = scene;
+        self.render_row(row, size, appearance, keep_going)
+    }
+
+    /// Renders a row of the device's table of views.
+    fn render_row(
+        &self,
+        row: u32,
+        size: (u32, u32),
+        appearance: u32,
+        keep_going: &mut dyn FnMut(f64) -> bool,
+    ) -> Result<Rendered> {
         let now = annealed(&self.schedule.at(self.step));
         self.renderer.view(
             &self.gpu,

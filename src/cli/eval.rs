@@ -1,0 +1,199 @@
+//! `neurodin eval`: how well a run renders held-out views, or how far a mesh is from the true surface.
+
+mod pictures;
+
+use std::fmt::Write;
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+use glam::DVec3;
+use serde_json::{Value, json};
+
+use super::Context;
+use super::render::Appearance;
+use super::scene_args::numbers;
+use crate::eval::geometry::{
+    Distances, GeometryOptions, GeometryScores, Reference, score_geometry,
+};
+use crate::mesh::{bounds, read_mesh};
+use crate::scene::{Scene, SceneOptions, Split, View};
+use crate::{Error, Result};
+
+/// Score a training run's pictures, or a mesh against the true surface
+#[derive(Args, Clone, Debug)]
+#[command(after_help = "Examples:
+  neurodin eval run/
+  neurodin eval --mesh mesh.ply --reference scan.ply --thresholds 0.005,0.01
+  neurodin eval --mesh mesh.ply --reference true.ply --reference points.ply --crop -1,-1,0,1,1,2 --visible-from photos/ --json
+
+Thresholds, distances and boxes are in the coordinates of the mesh and its reference, which must be the same.")]
+#[command(group = clap::ArgGroup::new("scored").required(true).args(["run", "mesh"]))]
+pub struct EvalArgs {
+    /// Run directory: PSNR and SSIM of its held-out views
+    pub run: Option<PathBuf>,
+    /// Appearance code of the rendered views [default: as the run's settings say]
+    #[arg(long, value_enum, value_name = "CODE", requires = "run")]
+    pub appearance: Option<Appearance>,
+    /// Where the run's dataset is now, if it has moved
+    #[arg(long, value_name = "DATASET", requires = "run")]
+    pub dataset: Option<PathBuf>,
+    /// Mesh to score (PLY or OBJ); without faces, its points
+    #[arg(long, value_name = "FILE", requires = "reference")]
+    pub mesh: Option<PathBuf>,
+    /// True surface as a mesh or a point cloud; given twice, accuracy is to the mesh and completeness from the points
+    #[arg(long, value_name = "FILE", requires = "mesh")]
+    pub reference: Vec<PathBuf>,
+    /// Distances for precision, recall and F-score [default: 0.5, 1 and 2 % of half the reference's diagonal]
+    #[arg(long, value_name = "A,B,..", value_delimiter = ',')]
+    pub thresholds: Vec<f64>,
+    /// Distances are cut off here for the trimmed Chamfer distance [default: 5 % of half the reference's diagonal]
+    #[arg(long, value_name = "D")]
+    pub trim: Option<f64>,
+    /// Score only what lies in this box
+    #[arg(long, value_name = "X0,Y0,Z0,X1,Y1,Z1", value_parser = numbers::<6>, allow_hyphen_values = true)]
+    pub crop: Option<[f64; 6]>,
+    /// Leave out of the mesh what no training view of this dataset sees
+    #[arg(long, value_name = "DATASET")]
+    pub visible_from: Option<PathBuf>,
+    /// Views that must see a place
+    #[arg(long, value_name = "N", default_value_t = 1, requires = "visible_from", value_parser = clap::value_parser!(u32).range(1..))]
+    pub min_views: u32,
+    /// Points drawn on a mesh
+    #[arg(long, value_name = "N", default_value_t = 500_000)]
+    pub samples: usize,
+    /// Seed of the points
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub seed: u64,
+}
+
+pub(super) fn run(args: &EvalArgs, context: &Context) -> anyhow::Result<()> {
+    let (report, text) = match (&args.run, &args.mesh) {
+        (Some(run), _) => pictures::score(run, args, context)?,
+        (None, Some(mesh)) => score_mesh(args, mesh)?,
+        (None, None) => unreachable!("clap requires one of them"),
+    };
+    Ok(context.result(&report, &text)?)
+}
+
+/// Scores `mesh` against its reference: the report for programs, and the one for people.
+///
+/// # Errors
+/// Those of reading the files and the dataset; `Config` where nothing can be compared.
+pub fn score_mesh(args: &EvalArgs, mesh: &Path) -> Result<(Value, String)> {
+    let ours = read_mesh(mesh)?;
+    let reference = read_reference(&args.reference)?;
+    let crop = args.crop.map(corners);
+    let [low, high] = crop.or(reference.bounds()).ok_or_else(|| {
+        let next = "give a mesh or points of the true surface";
+        Error::input(&args.reference[0], "has no points", next)
+    })?;
+    let size = 0.5 * (high - low).length();
+    let options = GeometryOptions {
+        samples: args.samples,
+        seed: args.seed,
+        thresholds: match args.thresholds[..] {
+            [] => [0.005, 0.01, 0.02].map(|share| share * size).to_vec(),
+            _ => args.thresholds.clone(),
+        },
+        trim: args.trim.unwrap_or(0.05 * size),
+        crop,
+        min_views: args.min_views,
+        hidden_by: 1e-3 * size,
+    };
+    let views = args
+        .visible_from
+        .as_ref()
+        .map(|dataset| training_views(dataset))
+        .transpose()?;
+    let scores = score_geometry(&ours, &reference, views.as_deref(), &options)?;
+    let mut report = json!({ "mesh": mesh, "reference": args.reference });
+    if let (Some(report), Ok(Value::Object(scores))) =
+        (report.as_object_mut(), serde_json::to_value(&scores))
+    {
+        report.extend(scores);
+    }
+    Ok((report, as_text(&scores)))
+}
+
+/// The lower and the upper corner, from any two opposite ones.
+fn corners([x0, y0, z0, x1, y1, z1]: [f64; 6]) -> [DVec3; 2] {
+    bounds(&[DVec3::new(x0, y0, z0), DVec3::new(x1, y1, z1)]).expect("two corners")
+}
+
+fn read_reference(paths: &[PathBuf]) -> Result<Reference> {
+    let mut reference = Reference::default();
+    for path in paths {
+        let part = Reference::from_mesh(read_mesh(path)?);
+        let next = "give one mesh, one point cloud, or one of each";
+        if part.mesh.is_some() && reference.mesh.is_some() {
+            return Err(Error::input(path, "is a second reference with faces", next));
+        }
+        if part.points.is_some() && reference.points.is_some() {
+            return Err(Error::input(
+                path,
+                "is a second reference without faces",
+                next,
+            ));
+        }
+        reference = Reference {
+            mesh: reference.mesh.or(part.mesh),
+            points: reference.points.or(part.points),
+        };
+    }
+    Ok(reference)
+}
+
+/// All views that are not set apart by the dataset itself.
+fn training_views(dataset: &Path) -> Result<Vec<View>> {
+    let options = SceneOptions {
+        holdout: 0,
+        masks: false,
+        ..Default::default()
+    };
+    let scene = Scene::open(dataset, &options)?;
+    Ok(scene
+        .views
+        .into_iter()
+        .filter(|view| view.split == Split::Train)
+        .collect())
+}
+
+fn as_text(scores: &GeometryScores) -> String {
+    let mut text = String::new();
+    let number = |value: Option<f64>| value.map_or("-".into(), |value| format!("{value:.6}"));
+    let mut row = |name: &str, value: String| {
+        let _ = writeln!(text, "{name:<13} {value}");
+    };
+    row(
+        "mesh",
+        format!(
+            "{} vertices, {} faces, {} of them scored",
+            scores.vertices, scores.faces, scores.faces_scored
+        ),
+    );
+    let distances = |d: &Distances| {
+        let [mean, median, high] = [d.mean, d.median, d.percentile_95].map(number);
+        format!(
+            "mean {mean}, median {median}, 95 % within {high} ({} points)",
+            d.points
+        )
+    };
+    row("accuracy", distances(&scores.accuracy));
+    row("completeness", distances(&scores.completeness));
+    let trimmed = format!(
+        "{:.6} with distances cut off at {:.6}",
+        scores.chamfer_trimmed, scores.trim
+    );
+    row("Chamfer", format!("{}; {trimmed}", number(scores.chamfer)));
+    for at in &scores.thresholds {
+        let [precision, recall] = [at.precision, at.recall].map(|share| 100.0 * share);
+        row(
+            &format!("at {:.6}", at.threshold),
+            format!(
+                "F {:.4}, precision {precision:.2} %, recall {recall:.2} %",
+                at.f_score
+            ),
+        );
+    }
+    text
+}

@@ -1,0 +1,415 @@
+//! `neurodin train`: a dataset becomes a run directory; or an interrupted run goes on.
+
+use super::progress::{Progress, clock};
+use super::scene_args::SceneArgs;
+use super::settings::SettingsArgs;
+use super::{Context, diagnostics, interrupt};
+use crate::config::{Config, Effect, MaskUse, RegionKind};
+use crate::gpu::Gpu;
+use crate::scene::{Facing, Looks, Region, RegionOverrides, RegionShape, Scene, Split};
+use crate::train::Trainer;
+use crate::train::checkpoint::{self, Latest};
+use crate::train::report::{Control, Event, Log};
+use crate::train::run_directory::{RunDirectory, SceneRecord, scene_options};
+use crate::{Error, Result};
+use anyhow::Context as _;
+use clap::Args;
+use serde_json::json;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+/// Train on a dataset, or go on with a run
+#[derive(Args)]
+#[command(after_help = "\
+Example:
+  neurodin train photos/ --out run
+  neurodin train photos/ --out run --preset outdoor-large --set hash.log2_size=22
+  neurodin train --out run --resume
+  neurodin train --preset indoor-tiny --print-config > mine.toml")]
+pub(super) struct TrainArgs {
+    /// Directory of the dataset, a transforms.json, or the directory of a COLMAP model; with --resume only if it has moved
+    #[arg(required_unless_present_any = ["resume", "print_config"])]
+    pub dataset: Option<PathBuf>,
+    /// Run directory to write
+    #[arg(
+        short,
+        long,
+        value_name = "RUN",
+        required_unless_present = "print_config"
+    )]
+    pub out: Option<PathBuf>,
+    /// Go on where the run stopped
+    #[arg(long, conflicts_with_all = ["force", "center", "radius", "boxed", "region_scale"])]
+    pub resume: bool,
+    /// Replace a run that is there already
+    #[arg(long)]
+    pub force: bool,
+    /// Prepare everything, say what would be done, and write nothing
+    #[arg(long)]
+    pub dry_run: bool,
+    /// Print every setting as TOML on stdout, and do nothing else
+    #[arg(long)]
+    pub print_config: bool,
+    #[command(flatten)]
+    pub settings: SettingsArgs,
+    #[command(flatten)]
+    pub scene: SceneArgs,
+}
+
+pub(super) fn run(args: &TrainArgs, context: &Context) -> anyhow::Result<()> {
+    let out = args.out.as_deref().unwrap_or(Path::new(""));
+    let task = match (args.resume, args.print_config) {
+        (true, true) => return Ok(context.print(&resumed(args, out)?.config.to_toml())?),
+        (true, false) => resume(args, out, context)?,
+        (false, true) => {
+            return Ok(context.print(&described(&args.settings, &args.scene)?.to_toml())?);
+        }
+        (false, false) => begin(args, out, context)?,
+    };
+    if args.dry_run {
+        context.say("dry run: nothing was written");
+        return Ok(context.result(&json!({ "dry_run": true, "config": task.config }), "")?);
+    }
+    task.run(args.force, context)
+}
+
+/// The scene flags' share of the settings.
+fn with_scene_flags(args: &SceneArgs, config: Config) -> Result<Config> {
+    let mut config = config;
+    if let Some(downscale) = args.downscale {
+        config.scene.downscale = downscale;
+    }
+    if let Some(holdout) = args.holdout {
+        config.scene.holdout = holdout;
+    }
+    if let Some(scale) = args.region_scale {
+        config.scene.region_scale = scale;
+    }
+    if args.no_masks {
+        config.scene.masks = MaskUse::Ignore;
+    }
+    config.validated()
+}
+
+/// The settings for a new run, as far as they are known without looking at its dataset.
+fn described(settings: &SettingsArgs, scene: &SceneArgs) -> Result<Config> {
+    with_scene_flags(scene, settings.resolve(Config::preset("outdoor-tiny")?)?)
+}
+
+/// The settings for a new run on a dataset, and why its preset was chosen if it was not named.
+pub(super) fn configure(
+    settings: &SettingsArgs,
+    flags: &SceneArgs,
+    scene: &Scene,
+) -> Result<(Config, String)> {
+    if settings.names_preset()? {
+        return Ok((described(settings, flags)?, String::new()));
+    }
+    let looks = Looks::of(scene);
+    let (name, kind) = match looks.facing {
+        Facing::Inward => ("outdoor-tiny", "inwards"),
+        Facing::Outward => ("indoor-tiny", "outwards"),
+    };
+    let config = with_scene_flags(flags, settings.resolve(Config::preset(name)?)?)?;
+    Ok((
+        config,
+        format!(" (the cameras look {kind}; --preset chooses another)"),
+    ))
+}
+
+/// What flags and settings say of the region.
+pub(super) fn region_wanted(flags: &SceneArgs, config: &Config) -> RegionOverrides {
+    flags.overrides(&RegionOverrides {
+        scale: config.scene.region_scale,
+        prefer_box: config.scene.shape == RegionKind::Box,
+        ..RegionOverrides::default()
+    })
+}
+
+/// The dataset as the flags say it should be read; no preset says otherwise.
+pub(super) fn open_scene(
+    settings: &SettingsArgs,
+    flags: &SceneArgs,
+    dataset: &Path,
+) -> Result<Scene> {
+    Scene::open(dataset, &scene_options(&described(settings, flags)?))
+}
+
+/// Everything a run needs, on the device, with nothing written yet.
+struct Task {
+    out: PathBuf,
+    config: Config,
+    scene: Scene,
+    record: SceneRecord,
+    trainer: Trainer,
+    /// The checkpoint that it goes on from.
+    resumed: Option<PathBuf>,
+}
+
+/// A new run.
+fn begin(args: &TrainArgs, out: &Path, context: &Context) -> anyhow::Result<Task> {
+    RunDirectory::check_free(out, args.force)?;
+    let dataset = args.dataset.as_deref().expect("clap requires it");
+    let scene = open_scene(&args.settings, &args.scene, dataset)?;
+    let (config, chosen) = configure(&args.settings, &args.scene, &scene)?;
+    let region = Region::estimate(&scene, &region_wanted(&args.scene, &config))?;
+    context.say(&format!(
+        "dataset  {}, {}: {} views to train on, {} held out{}",
+        dataset.display(),
+        scene.format,
+        scene.split(Split::Train).count(),
+        scene.split(Split::Test).count(),
+        match scene.skipped.len() {
+            0 => String::new(),
+            skipped => format!(", {skipped} things skipped (`neurodin inspect` says which)"),
+        }
+    ));
+    context.say(&format!("region   {}", in_words(&region)));
+    context.say(&format!(
+        "preset   {}{chosen}, {} steps, seed {}",
+        config.preset, config.steps, config.seed
+    ));
+    let gpu = context.gpu()?;
+    let trainer = Trainer::new(&gpu, &scene, &region, &config)?;
+    say_device(&gpu, args.dry_run, context);
+    Ok(Task {
+        out: out.into(),
+        record: SceneRecord::new(dataset, &scene, &region)?,
+        config,
+        scene,
+        trainer,
+        resumed: None,
+    })
+}
+
+/// The device, and what of its memory is used from here to the end: everything is allocated before the first step.
+fn say_device(gpu: &Gpu, in_full: bool, context: &Context) {
+    let plan = gpu.memory_plan();
+    let mib = |bytes: u64| bytes as f64 / f64::from(1 << 20);
+    context.say(&format!(
+        "device   {}: {:.0} MiB in {} buffers, of {:.0} MiB",
+        gpu.info().name,
+        mib(plan.total),
+        plan.buffers.len(),
+        mib(plan.budget)
+    ));
+    if in_full {
+        context.say(&plan.to_string());
+    }
+}
+
+fn in_words(region: &Region) -> String {
+    let (center, radius) = (region.center, region.radius);
+    let shape = match region.shape {
+        RegionShape::Sphere => format!("sphere of radius {radius:.4}"),
+        RegionShape::Box { half } => {
+            let size = 2.0 * radius * half;
+            format!("box of {:.4} x {:.4} x {:.4}", size.x, size.y, size.z)
+        }
+    };
+    format!(
+        "{shape} about ({:.4}, {:.4}, {:.4}), {}",
+        center.x, center.y, center.z, region.how
+    )
+}
+
+/// A run that is gone on with.
+struct Resumed {
+    run: RunDirectory,
+    latest: Latest,
+    config: Config,
+}
+
+/// What there is to go on from, under the settings that were asked for now.
+fn resumed(args: &TrainArgs, out: &Path) -> Result<Resumed> {
+    let run = RunDirectory::open(out)?;
+    let latest = checkpoint::latest(&run.checkpoints())?;
+    let config = args
+        .settings
+        .resolve(latest.checkpoint.state().config.clone())
+        .and_then(|config| with_scene_flags(&args.scene, config))?;
+    Ok(Resumed {
+        run,
+        latest,
+        config,
+    })
+}
+
+fn resume(args: &TrainArgs, out: &Path, context: &Context) -> anyhow::Result<Task> {
+    let Resumed {
+        run,
+        latest,
+        config,
+    } = resumed(args, out)?;
+    for refused in &latest.refused {
+        context.warn(&refused.to_string());
+    }
+    let state = latest.checkpoint.state();
+    let differences = state.config.differences(&config);
+    let refused: Vec<_> = differences
+        .iter()
+        .filter(|difference| difference.effect == Effect::Incompatible)
+        .map(ToString::to_string)
+        .collect();
+    if !refused.is_empty() {
+        return Err(Error::Config {
+            what: format!(
+                "{}: what was learned does not fit these changed settings:\n  {}\n  next: resume without them, or begin a new run in another --out",
+                latest.checkpoint.path().display(),
+                refused.join("\n  ")
+            ),
+        }
+        .into());
+    }
+    for difference in &differences {
+        match difference.effect {
+            Effect::None => context.say(&format!("changed  {difference}")),
+            _ => context.warn(&format!(
+                "changed setting {difference}: the run goes on differently from how it began"
+            )),
+        }
+    }
+    context.say(&format!(
+        "resume   {} of {} steps done, from {}",
+        state.step,
+        config.steps,
+        latest.checkpoint.path().display()
+    ));
+    let record = SceneRecord::load(&run)?;
+    let scene = record.open(args.dataset.as_deref(), &config)?;
+    let gpu = context.gpu()?;
+    let mut trainer = Trainer::new(&gpu, &scene, &state.region, &config)?;
+    trainer.restore(&latest.checkpoint)?;
+    say_device(&gpu, args.dry_run, context);
+    diagnostics::note_checkpoint(latest.checkpoint.path());
+    Ok(Task {
+        out: out.into(),
+        record,
+        config,
+        scene,
+        trainer,
+        resumed: Some(latest.checkpoint.path().into()),
+    })
+}
+
+impl Task {
+    fn run(mut self, force: bool, context: &Context) -> anyhow::Result<()> {
+        let run = match &self.resumed {
+            Some(_) => RunDirectory::resume(&self.out)?,
+            None => RunDirectory::create(&self.out, force)?,
+        };
+        run.write(&run.scene(), &self.record.to_json())?;
+        run.write(&run.config(), &self.config.to_toml())?;
+        let interrupted = interrupt::flag("saving a checkpoint")?;
+        let mut teller = Teller {
+            context,
+            log: Log::append(&run.log())?,
+            progress: Progress::new(context, "train", self.config.steps),
+            interrupted: &interrupted,
+            note: String::new(),
+            failed: None,
+            psnr: None,
+            checkpoint: self.resumed.clone(),
+        };
+        if let Some(path) = self.resumed.take() {
+            let step = self.trainer.steps_done();
+            teller.hear(Event::Resumed { step, path });
+        }
+        let begun = Instant::now();
+        let outcome = self
+            .trainer
+            .run(&self.scene, &run, &mut |event| teller.hear(event));
+        let Teller {
+            failed,
+            psnr,
+            checkpoint,
+            ..
+        } = teller;
+        if let Some(error) = failed {
+            return Err(error.into());
+        }
+        outcome.with_context(|| match &checkpoint {
+            Some(path) => format!("the last checkpoint is {}", path.display()),
+            None => "there is no checkpoint of this run yet".into(),
+        })?;
+        let seconds = begun.elapsed();
+        let result = json!({
+            "run": run.root(),
+            "step": self.trainer.steps_done(),
+            "seconds": seconds.as_secs_f64(),
+            "preview_psnr": psnr,
+            "checkpoint": checkpoint,
+        });
+        let text = format!(
+            "done     {} steps in {}; next: neurodin mesh {} -o mesh.ply",
+            self.trainer.steps_done(),
+            clock(seconds),
+            run.root().display()
+        );
+        Ok(context.result(&result, &text)?)
+    }
+}
+
+/// Passes a run's events on: to its log, to stderr, and to the progress line.
+struct Teller<'t> {
+    context: &'t Context,
+    log: Log,
+    progress: Progress,
+    interrupted: &'t AtomicBool,
+    /// The last losses, for the progress line.
+    note: String,
+    /// What the log failed with.
+    failed: Option<Error>,
+    psnr: Option<f64>,
+    checkpoint: Option<PathBuf>,
+}
+
+impl Teller<'_> {
+    fn hear(&mut self, event: Event) -> Control {
+        if let Err(error) = self.log.write(&event) {
+            self.failed.get_or_insert(error);
+        }
+        let text = match &event {
+            Event::Advanced { step, .. } => {
+                diagnostics::note_step(*step);
+                self.progress.at(*step, &self.note);
+                return self.answer();
+            }
+            Event::Step { losses, psnr, .. } => {
+                self.note = format!(
+                    "loss {:.4} (colour {:.4}, eikonal {:.4}, bias {:.5}, proposal {:.5})  {psnr:.2} dB",
+                    losses.total, losses.color, losses.eikonal, losses.bias, losses.interlevel
+                );
+                String::new()
+            }
+            Event::Preview {
+                step, path, psnr, ..
+            } => {
+                self.psnr = Some(*psnr);
+                format!("preview  step {step}: {psnr:.2} dB, {}", path.display())
+            }
+            Event::Saved {
+                step,
+                path,
+                seconds,
+            } => {
+                diagnostics::note_checkpoint(path);
+                self.checkpoint = Some(path.clone());
+                let took = Duration::from_secs_f64(*seconds);
+                format!("saved    step {step}: {} ({took:.1?})", path.display())
+            }
+            Event::Warning { what, .. } => format!("warning  {what}"),
+            _ => String::new(),
+        };
+        self.context.tell(event.record(), &text);
+        self.answer()
+    }
+
+    fn answer(&self) -> Control {
+        match self.interrupted.load(Ordering::SeqCst) || self.failed.is_some() {
+            true => Control::Stop,
+            false => Control::Continue,
+        }
+    }
+}

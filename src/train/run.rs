@@ -1,0 +1,375 @@
+//! The run around the step: when to tell, to look and to save, and how to go on later exactly where it stopped.
+
+use super::checkpoint::{self, Checkpoint, State, Tensor};
+use super::report::{Control, Event, Losses, Pace};
+use super::run_directory::RunDirectory;
+use super::{StepLosses, Trainer};
+use crate::config::Config;
+use crate::gpu::Buffer;
+use crate::render::{Rendered, TERMS};
+use crate::scene::{Camera, Scene, Split};
+use crate::{Error, Result};
+use glam::DMat4;
+use image::imageops::{self, FilterType};
+use image::{RgbImage, RgbaImage};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+/// After so many steps in a row without finite losses, none of which changed the parameters, training gives up.
+const BAD_STEPS: u32 = 10;
+
+impl Trainer {
+    /// Trains from where this stands to the end of the configuration's steps, writing previews and checkpoints into `run`.
+    /// `tell` hears of everything that happens; once it answers [`Control::Stop`] a checkpoint is saved and the run ends.
+    ///
+    /// # Errors
+    /// [`Error::Interrupted`] when stopped; [`Error::Numerical`] when losses stay non-finite; [`Error::Output`] when a picture or a
+    /// checkpoint cannot be written; whatever the device fails with. Checkpoints that were saved before stay.
+    pub fn run(
+        &mut self,
+        scene: &Scene,
+        run: &RunDirectory,
+        tell: &mut dyn FnMut(Event) -> Control,
+    ) -> Result<()> {
+        let began = Instant::now();
+        let steps = self.config.steps;
+        let report = self.config.report.clone();
+        let mut stop = false;
+        let mut tell = |event: Event| {
+            stop |= tell(event) == Control::Stop;
+            stop
+        };
+        tell(Event::Started {
+            step: self.step,
+            steps,
+            device: self.gpu.info().name.clone(),
+            train_views: scene.split(Split::Train).count(),
+            test_views: scene.split(Split::Test).count(),
+            parameters: self
+                .model
+                .params
+                .spans()
+                .iter()
+                .map(|span| span.len())
+                .sum(),
+        });
+        let mut pace = Pace::default();
+        pace.mark(self.step);
+        let mut bad = BadSteps::default();
+        let mut saved = (self.step, Instant::now());
+        while self.step < steps {
+            self.step()?;
+            let step = self.step;
+            let mut stopping = tell(Event::Advanced { step, steps });
+            let losses = self.losses()?;
+            if let Some(losses) = &losses {
+                bad.watch(losses, run)?;
+                if step.is_multiple_of(report.log_steps) {
+                    pace.mark(step);
+                    stopping |= tell(told(losses, steps, pace.per_second()));
+                }
+            }
+            let last = step == steps;
+            if !stopping && due(step, report.preview_steps, last) {
+                let begun = Instant::now();
+                match self.look(scene, &run.preview(step), &mut || {
+                    tell(Event::Advanced { step, steps })
+                }) {
+                    Ok(Some(psnr)) => {
+                        let path = run.preview(step);
+                        let seconds = begun.elapsed().as_secs_f64();
+                        stopping |= tell(Event::Preview {
+                            step,
+                            path,
+                            psnr,
+                            seconds,
+                        });
+                    }
+                    Ok(None) => {}
+                    Err(Error::Interrupted { .. }) => stopping = true,
+                    Err(error) => return Err(error),
+                }
+            }
+            let overdue = report.checkpoint_minutes > 0.0
+                && saved.1.elapsed().as_secs_f64() >= 60.0 * report.checkpoint_minutes;
+            if stopping || last || overdue || due(step, report.checkpoint_steps, false) {
+                if let Some(losses) = self.finish()? {
+                    bad.watch(&losses, run)?;
+                    if last && !step.is_multiple_of(report.log_steps) {
+                        pace.mark(step);
+                        tell(told(&losses, steps, pace.per_second()));
+                    }
+                }
+                let begun = Instant::now();
+                let path = self.save(&run.checkpoints())?;
+                saved = (step, Instant::now());
+                tell(Event::Saved {
+                    step,
+                    path,
+                    seconds: begun.elapsed().as_secs_f64(),
+                });
+            }
+            if stopping && !last {
+                return Err(Error::Interrupted {
+                    what: format!(
+                        "stopped after step {step} of {steps}; a checkpoint of it was saved, --resume goes on from there"
+                    ),
+                });
+            }
+        }
+        if saved.0 != self.step || checkpoint::files(&run.checkpoints())?.is_empty() {
+            self.save(&run.checkpoints())?;
+        }
+        tell(Event::Finished {
+            step: self.step,
+            seconds: began.elapsed().as_secs_f64(),
+        });
+        Ok(())
+    }
+
+    /// Writes a checkpoint of everything that later steps depend on into `folder`; see [`checkpoint::save`].
+    ///
+    /// # Errors
+    /// [`Error::Output`] if it cannot be written; what reading device memory fails with.
+    pub fn save(&self, folder: &Path) -> Result<PathBuf> {
+        self.gpu.finish()?;
+        let state = State {
+            step: self.step,
+            config: self.config.clone(),
+            region: self.region.clone(),
+            extra: BTreeMap::new(),
+        };
+        let parts = self.parts();
+        let tensors: Vec<Tensor> = parts.iter().map(|(tensor, ..)| tensor.clone()).collect();
+        checkpoint::save(
+            folder,
+            self.config.report.keep,
+            &state,
+            &tensors,
+            &mut |tensor, range| {
+                let (_, buffer, first) = parts
+                    .iter()
+                    .find(|(part, ..)| part == tensor)
+                    .expect("asked for what was offered");
+                self.gpu
+                    .download(buffer, first + range.start, range.end - range.start)
+            },
+        )
+    }
+
+    /// Takes the state of a checkpoint, which must be of the same model and region.
+    ///
+    /// # Errors
+    /// [`Error::Input`] if the tensors do not fit; what writing device memory fails with.
+    pub fn restore(&mut self, checkpoint: &Checkpoint) -> Result<()> {
+        let state = checkpoint.state();
+        if state.region != self.region {
+            return Err(Error::input(
+                checkpoint.path(),
+                "belongs to another region than this run's",
+                "resume without changing the region, or begin a new run",
+            ));
+        }
+        for (tensor, buffer, first) in self.parts() {
+            checkpoint.read(&tensor, &mut |offset, numbers| {
+                self.gpu.upload(buffer, first + offset, numbers)
+            })?;
+        }
+        self.gpu.finish()?;
+        self.step = state.step;
+        self.tickets.clear();
+        Ok(())
+    }
+
+    /// What a checkpoint holds: parameters and their moments, each with its place on the device.
+    fn parts(&self) -> Vec<(Tensor, &Buffer<f32>, u64)> {
+        let params = &self.model.params;
+        let blocks = [
+            ("", params.values()),
+            ("first_moment.", params.first_moment()),
+            ("second_moment.", params.second_moment()),
+        ];
+        blocks
+            .into_iter()
+            .flat_map(|(prefix, buffer)| {
+                params.spans().iter().map(move |span| {
+                    let tensor = Tensor {
+                        name: format!("{prefix}{}", span.name),
+                        shape: span.shape.clone(),
+                    };
+                    (tensor, buffer, span.first)
+                })
+            })
+            .collect()
+    }
+
+    /// Writes a preview: photograph, rendering and normals side by side. Returns the rendering's PSNR, or `None` if there is no view.
+    fn look(
+        &self,
+        scene: &Scene,
+        path: &Path,
+        stop: &mut dyn FnMut() -> bool,
+    ) -> Result<Option<f64>> {
+        let Some(preview) = &self.preview else {
+            return Ok(None);
+        };
+        let (width, height) = (preview.camera.width, preview.camera.height);
+        let row = self.view_order.len() as u32;
+        let appearance = self.views.n_training();
+        let rendered = self.render_row(row, (width, height), appearance, &mut |_| !stop())?;
+        let picture = scene.load_picture(preview.view)?;
+        let photo = RgbaImage::from_raw(picture.width, picture.height, picture.rgba)
+            .expect("a picture has four bytes a pixel");
+        let photo = imageops::resize(&photo, width, height, FilterType::Triangle);
+        let psnr = psnr(&rendered, &photo);
+        side_by_side(&rendered, &photo)
+            .save(path)
+            .map_err(|error| {
+                Error::output(
+                    path,
+                    format!("cannot write this preview: {error}"),
+                    "make room or mend the permissions there, then go on with --resume",
+                )
+            })?;
+        Ok(Some(psnr))
+    }
+}
+
+/// Whether something that happens every `interval` steps (0: never) happens after this one, or `at_last` at the end.
+fn due(step: u64, interval: u64, at_last: bool) -> bool {
+    interval > 0 && (step.is_multiple_of(interval) || at_last)
+}
+
+/// The view that previews show, with a camera of their size.
+pub(super) struct PreviewView {
+    pub view: usize,
+    pub camera: Camera,
+    pub world_from_camera: DMat4,
+}
+
+impl PreviewView {
+    /// The middle one of the held-out views, or of all where none is held out; `None` if previews are off.
+    pub fn choose(scene: &Scene, config: &Config) -> Option<PreviewView> {
+        if config.report.preview_steps == 0 {
+            return None;
+        }
+        let held_out: Vec<usize> = scene.split(Split::Test).collect();
+        let view = match held_out.len() {
+            0 => scene.views.len() / 2,
+            count => held_out[count / 2],
+        };
+        let from = scene.views.get(view)?;
+        let pixels = f64::from(from.camera.width) * f64::from(from.camera.height);
+        let scale = (config.report.preview_pixels as f64 / pixels)
+            .sqrt()
+            .min(1.0);
+        let reduced = |size: u32| ((f64::from(size) * scale).floor() as u32).max(1);
+        Some(PreviewView {
+            view,
+            camera: from
+                .camera
+                .scaled(reduced(from.camera.width), reduced(from.camera.height)),
+            world_from_camera: from.world_from_camera,
+        })
+    }
+}
+
+/// 8-bit value of a number in [0, 1].
+fn byte(value: f32) -> u8 {
+    (value.clamp(0.0, 1.0) * 255.0).round() as u8
+}
+
+fn psnr(rendered: &Rendered, photo: &RgbaImage) -> f64 {
+    let squares: f64 = rendered
+        .rgb
+        .iter()
+        .zip(photo.pixels())
+        .flat_map(|(ours, theirs)| {
+            (0..3).map(|c| f64::from(ours[c].clamp(0.0, 1.0)) - f64::from(theirs[c]) / 255.0)
+        })
+        .map(|difference| difference * difference)
+        .sum();
+    -10.0 * (squares / (3 * rendered.rgb.len()) as f64).log10()
+}
+
+fn side_by_side(rendered: &Rendered, photo: &RgbaImage) -> RgbImage {
+    let (width, height) = (rendered.width, rendered.height);
+    RgbImage::from_fn(3 * width, height, |x, y| {
+        let at = (y * width + x % width) as usize;
+        image::Rgb(match x / width {
+            0 => [0, 1, 2].map(|c| photo[(x, y)][c]),
+            1 => rendered.rgb[at].map(byte),
+            _ => rendered.normal[at].map(|n| byte(0.5 + 0.5 * n)),
+        })
+    })
+}
+
+/// A finished step's losses as an event.
+fn told(losses: &StepLosses, steps: u64, it_per_s: f64) -> Event {
+    let of = |wanted: &str| -> f64 {
+        TERMS
+            .iter()
+            .zip(&losses.values)
+            .filter(|(name, _)| name.starts_with(wanted))
+            .map(|(_, value)| f64::from(*value))
+            .sum()
+    };
+    Event::Step {
+        step: losses.step + 1,
+        steps,
+        losses: Losses {
+            total: f64::from(losses.values[TERMS.len()]),
+            color: of("color"),
+            eikonal: of("eikonal"),
+            bias: of("bias"),
+            interlevel: of("interlevel"),
+        },
+        psnr: -10.0 * of("mse").log10(),
+        crossing: of("crossing"),
+        it_per_s,
+    }
+}
+
+/// Counts steps in a row whose losses were not finite.
+#[derive(Default)]
+struct BadSteps {
+    last: Option<u64>,
+    count: u32,
+}
+
+impl BadSteps {
+    fn watch(&mut self, losses: &StepLosses, run: &RunDirectory) -> Result<()> {
+        if self.last == Some(losses.step) {
+            return Ok(());
+        }
+        self.last = Some(losses.step);
+        let total = losses.values[TERMS.len()];
+        if total.is_finite() {
+            self.count = 0;
+            return Ok(());
+        }
+        self.count += 1;
+        if self.count < BAD_STEPS {
+            return Ok(());
+        }
+        let terms: Vec<String> = TERMS
+            .iter()
+            .zip(&losses.values)
+            .map(|(name, value)| format!("{name} {value}"))
+            .collect();
+        let next = match checkpoint::files(&run.checkpoints())?.last() {
+            Some((step, _)) => format!(
+                "the checkpoint of step {step} is intact: --resume it with smaller learning rates"
+            ),
+            None => "begin again with smaller learning rates".into(),
+        };
+        Err(Error::Numerical {
+            what: format!(
+                "the loss has not been finite for {BAD_STEPS} steps, up to step {} ({})\n  next: {next} (optimizer.*.learning_rate), and look at the dataset and its region with `neurodin inspect`",
+                losses.step,
+                terms.join(", ")
+            ),
+        })
+    }
+}

@@ -1,0 +1,358 @@
+//! Where a run keeps what it makes: a folder with `config.toml`, `scene.json`, `log.jsonl`, `previews/` and `ckpt/`.
+
+use crate::config::{Config, MaskUse};
+use crate::scene::{Format, Region, Scene, SceneOptions, Split};
+use crate::{Error, Result};
+use serde::{Deserialize, Serialize};
+use std::fs::{self, File};
+use std::io::{ErrorKind, Write};
+use std::path::{Path, PathBuf};
+
+/// The folder of a run.
+#[derive(Debug)]
+pub struct RunDirectory {
+    root: PathBuf,
+    /// Held while a process writes here; the system lets go of it when the process ends, however it ends.
+    _lock: Option<File>,
+}
+
+impl RunDirectory {
+    /// Makes the folder for a new run. One that holds anything already is refused unless `replace`, which removes the parts of a
+    /// former run and nothing else.
+    ///
+    /// # Errors
+    /// [`Error::Output`] if it exists, is in use by another process, or cannot be written.
+    pub fn create(root: &Path, replace: bool) -> Result<RunDirectory> {
+        RunDirectory::check_free(root, replace)?;
+        let failed = |path: &Path, error: std::io::Error| {
+            Error::output(
+                path,
+                format!("cannot write there: {error}"),
+                "give another --out",
+            )
+        };
+        fs::create_dir_all(root).map_err(|error| failed(root, error))?;
+        let run = RunDirectory {
+            root: root.into(),
+            _lock: lock(root)?,
+        };
+        for file in [run.config(), run.scene(), run.log()] {
+            remove(&file, |path| fs::remove_file(path))?;
+        }
+        for folder in [run.previews(), run.checkpoints()] {
+            remove(&folder, |path| fs::remove_dir_all(path))?;
+            fs::create_dir_all(&folder).map_err(|error| failed(&folder, error))?;
+        }
+        Ok(run)
+    }
+
+    /// Whether [`RunDirectory::create`] would find the place free; changes nothing.
+    ///
+    /// # Errors
+    /// [`Error::Output`] if not.
+    pub fn check_free(root: &Path, replace: bool) -> Result<()> {
+        let holds_something = |mut entries: fs::ReadDir| {
+            entries.any(|entry| entry.is_ok_and(|entry| entry.file_name() != LOCK))
+        };
+        let empty = match fs::read_dir(root).map(|entries| !holds_something(entries)) {
+            Ok(empty) => empty,
+            Err(error) if error.kind() == ErrorKind::NotFound => true,
+            Err(error) => return Err(Error::output(root, error.to_string(), "give another --out")),
+        };
+        if empty || replace {
+            Ok(())
+        } else if root.join("config.toml").exists() {
+            Err(Error::output(
+                root,
+                "holds a run already",
+                "go on with it by --resume, replace it by --force, or give another --out",
+            ))
+        } else {
+            Err(Error::output(
+                root,
+                "exists and is not empty",
+                "give another --out, or --force to write into it",
+            ))
+        }
+    }
+
+    /// An existing run, to be gone on with.
+    ///
+    /// # Errors
+    /// As [`RunDirectory::open`]; [`Error::Output`] if another process is writing there.
+    pub fn resume(root: &Path) -> Result<RunDirectory> {
+        let run = RunDirectory::open(root)?;
+        Ok(RunDirectory {
+            _lock: lock(root)?,
+            ..run
+        })
+    }
+
+    /// An existing run, to be read.
+    ///
+    /// # Errors
+    /// [`Error::Input`] if there is none.
+    pub fn open(root: &Path) -> Result<RunDirectory> {
+        let run = RunDirectory {
+            root: root.into(),
+            _lock: None,
+        };
+        match run.config().is_file() {
+            true => Ok(run),
+            false => Err(Error::input(
+                root,
+                "is no run directory: it holds no config.toml",
+                "name the folder that `neurodin train --out` wrote",
+            )),
+        }
+    }
+
+    pub fn root(&self) -> &Path {
+        &self.root
+    }
+
+    /// The resolved configuration, commented.
+    pub fn config(&self) -> PathBuf {
+        self.root.join("config.toml")
+    }
+
+    /// Dataset, region and views.
+    pub fn scene(&self) -> PathBuf {
+        self.root.join("scene.json")
+    }
+
+    pub fn log(&self) -> PathBuf {
+        self.root.join("log.jsonl")
+    }
+
+    pub fn checkpoints(&self) -> PathBuf {
+        self.root.join("ckpt")
+    }
+
+    pub fn previews(&self) -> PathBuf {
+        self.root.join("previews")
+    }
+
+    /// The picture of a held-out view after so many steps.
+    pub fn preview(&self, step: u64) -> PathBuf {
+        self.previews().join(format!("step-{step:08}.png"))
+    }
+
+    /// Writes a small text file whole or not at all.
+    ///
+    /// # Errors
+    /// [`Error::Output`] if it cannot be written.
+    pub fn write(&self, path: &Path, text: &str) -> Result<()> {
+        let part = path.with_extension("part");
+        let written = File::create(&part).and_then(|mut file| {
+            file.write_all(text.as_bytes())?;
+            file.sync_all()?;
+            fs::rename(&part, path)
+        });
+        written.map_err(|error| {
+            Error::output(
+                path,
+                format!("cannot be written: {error}"),
+                "make room or mend the permissions there",
+            )
+        })
+    }
+}
+
+fn remove(path: &Path, remove: impl Fn(&Path) -> std::io::Result<()>) -> Result<()> {
+    match remove(path) {
+        Err(error) if error.kind() != ErrorKind::NotFound => Err(Error::output(
+            path,
+            format!("cannot be replaced: {error}"),
+            "give another --out",
+        )),
+        _ => Ok(()),
+    }
+}
+
+/// Name of the file whose lock says that a process writes to a run.
+const LOCK: &str = ".lock";
+
+/// Takes the folder for this process. File systems without locks go without.
+fn lock(root: &Path) -> Result<Option<File>> {
+    let path = root.join(LOCK);
+    let file = File::create(&path).map_err(|error| {
+        Error::output(
+            root,
+            format!("cannot write there: {error}"),
+            "mend the permissions",
+        )
+    })?;
+    match file.try_lock() {
+        Ok(()) => Ok(Some(file)),
+        Err(fs::TryLockError::WouldBlock) => Err(Error::output(
+            root,
+            "another process is training there",
+            "wait for it or stop it, or give another --out",
+        )),
+        Err(fs::TryLockError::Error(_)) => Ok(None),
+    }
+}
+
+/// What a run was trained on: enough to open the same views again, and to take results to the input's coordinates.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct SceneRecord {
+    /// Absolute path of the dataset.
+    pub dataset: PathBuf,
+    pub format: Format,
+    pub region: Region,
+    /// Rows of the matrix that takes region coordinates to the input's.
+    pub world_from_region: [[f64; 4]; 4],
+    pub views: Vec<ViewRecord>,
+}
+
+/// A view as a run knows it.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ViewRecord {
+    pub name: String,
+    pub split: Split,
+    /// Of the picture as it is trained with.
+    pub width: u32,
+    pub height: u32,
+}
+
+/// How a configuration reads its dataset.
+pub fn scene_options(config: &Config) -> SceneOptions {
+    SceneOptions {
+        downscale: config.scene.downscale,
+        holdout: config.scene.holdout,
+        masks: config.scene.masks == MaskUse::Exclude,
+    }
+}
+
+impl SceneRecord {
+    /// What `scene`, opened from `dataset`, is to a run.
+    ///
+    /// # Errors
+    /// [`Error::Io`] if the dataset's path cannot be resolved.
+    pub fn new(dataset: &Path, scene: &Scene, region: &Region) -> Result<SceneRecord> {
+        let rows = region.world_from_region().transpose().to_cols_array_2d();
+        Ok(SceneRecord {
+            dataset: fs::canonicalize(dataset).map_err(|error| Error::io(dataset, error))?,
+            format: scene.format,
+            region: region.clone(),
+            world_from_region: rows,
+            views: views(scene),
+        })
+    }
+
+    /// As JSON.
+    pub fn to_json(&self) -> String {
+        serde_json::to_string_pretty(self).expect("a record is plain data") + "\n"
+    }
+
+    /// The record of a run.
+    ///
+    /// # Errors
+    /// [`Error::Input`] if there is none or it cannot be read.
+    pub fn load(run: &RunDirectory) -> Result<SceneRecord> {
+        let path = run.scene();
+        let unusable = |why: String| {
+            Error::input(
+                &path,
+                why,
+                "a run's scene.json is written by `neurodin train`; restore it from there",
+            )
+        };
+        let text = fs::read_to_string(&path).map_err(|error| unusable(error.to_string()))?;
+        serde_json::from_str(&text).map_err(|error| unusable(error.to_string()))
+    }
+
+    /// Opens the dataset again, here or at `moved`, as `config` says.
+    ///
+    /// # Errors
+    /// What [`Scene::open`] fails with; [`Error::Input`] if it no longer holds the views that were trained with.
+    pub fn open(&self, moved: Option<&Path>, config: &Config) -> Result<Scene> {
+        let dataset = moved.unwrap_or(&self.dataset);
+        let scene = Scene::open(dataset, &scene_options(config))?;
+        let now = views(&scene);
+        if now == self.views {
+            return Ok(scene);
+        }
+        let changed = self
+            .views
+            .iter()
+            .zip(&now)
+            .find(|(was, is)| was != is)
+            .map_or_else(
+                || format!("it holds {} views", now.len()),
+                |(was, is)| {
+                    format!(
+                        "where there was '{}' ({} x {}, {:?}) there is '{}' ({} x {}, {:?})",
+                        was.name,
+                        was.width,
+                        was.height,
+                        was.split,
+                        is.name,
+                        is.width,
+                        is.height,
+                        is.split
+                    )
+                },
+            );
+        Err(Error::input(
+            dataset,
+            format!(
+                "is not the dataset that the run was trained on, which held {} views: {changed}",
+                self.views.len()
+            ),
+            "restore it, name where it is now, or begin a new run",
+        ))
+    }
+}
+
+fn views(scene: &Scene) -> Vec<ViewRecord> {
+    scene
+        .views
+        .iter()
+        .map(|view| ViewRecord {
+            name: view.name.clone(),
+            split: view.split,
+            width: view.camera.width,
+            height: view.camera.height,
+        })
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_run_is_neither_overwritten_nor_shared() {
+        let folder = tempfile::tempdir().unwrap();
+        let root = folder.path().join("run");
+        assert!(
+            RunDirectory::open(&root)
+                .unwrap_err()
+                .to_string()
+                .contains("no run directory")
+        );
+        let run = RunDirectory::create(&root, false).unwrap();
+        run.write(&run.config(), "steps = 1\n").unwrap();
+        fs::write(run.preview(5), b"png").unwrap();
+        fs::write(root.join("notes.txt"), b"mine").unwrap();
+        assert!(matches!(
+            RunDirectory::create(&root, false),
+            Err(Error::Output { .. })
+        ));
+        let shared = RunDirectory::resume(&root).unwrap_err().to_string();
+        assert!(shared.contains("another process"), "{shared}");
+        let shared = RunDirectory::create(&root, true).unwrap_err().to_string();
+        assert!(shared.contains("another process"), "{shared}");
+        assert!(run.preview(5).exists(), "nothing was removed");
+        drop(run);
+        drop(RunDirectory::resume(&root).unwrap());
+        let run = RunDirectory::create(&root, true).unwrap();
+        assert!(!run.preview(5).exists() && !run.config().exists());
+        assert!(
+            root.join("notes.txt").exists(),
+            "what is not of a run stays"
+        );
+    }
+}
