@@ -26,10 +26,9 @@ layout(push_constant, scalar) uniform Args {
 const float OPAQUE = 0.999;
 
 void main() {
-    uint group = gl_WorkGroupID.y * 256u + gl_WorkGroupID.x;
     uint n_groups = gl_NumWorkGroups.x * gl_NumWorkGroups.y;
     uint lane = gl_SubgroupInvocationID;
-    for (uint ray = group * gl_NumSubgroups + gl_SubgroupID; ray < n; ray += n_groups * gl_NumSubgroups) {
+    for (uint ray = group() * gl_NumSubgroups + gl_SubgroupID; ray < n; ray += n_groups * gl_NumSubgroups) {
         uint row = ray * n_samples;
         float best = -1.0, lowest = 1e30, sum = 0.0;
         uint best_index = n_samples - 1u;

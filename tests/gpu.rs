@@ -8,6 +8,15 @@ fn open() -> Result<Gpu> {
     Gpu::new(&GpuOptions::default())
 }
 
+/// Under validation and with guard words.
+fn open_watched() -> Result<Gpu> {
+    Gpu::new(&GpuOptions {
+        validation: true,
+        guard: true,
+        ..GpuOptions::default()
+    })
+}
+
 fn run_fill(gpu: &Gpu, n: u32) -> Result<()> {
     let values = gpu.buffer::<f32>("values", n as u64)?;
     let kernel = gpu.kernel(fill::Shape::default())?;
@@ -65,4 +74,15 @@ fn an_unknown_device_is_refused_with_the_list() {
         text.contains("no such device") && text.contains(&first.name),
         "{text}"
     );
+}
+
+#[test]
+fn the_validation_layer_has_nothing_to_say() -> Result<()> {
+    let gpu = open_watched()?;
+    let log = gpu.validation_log();
+    run_fill(&gpu, 100_000)?;
+    assert_eq!(gpu.check_guards()?, []);
+    drop(gpu);
+    assert_eq!(log.messages(), Vec::<String>::new());
+    Ok(())
 }

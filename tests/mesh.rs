@@ -1,11 +1,14 @@
 //! Mesh extraction against analytic surfaces: closed, manifold, where the field is zero, the same whatever the block size.
 
+use std::cell::Cell;
 use std::collections::HashMap;
 
-use glam::{DMat4, DVec3};
-use neurodin::Result;
-use neurodin::mesh::extract::{PointAttributes, extract_surface};
-use neurodin::mesh::{Domain, ExtractOptions, Lattice, Mesh, SurfaceAttributes, extract_mesh};
+use glam::{DMat4, DQuat, DVec3};
+use neurodin::mesh::extract::{PointAttributes, extract_surface, to_world};
+use neurodin::mesh::{
+    Domain, ExtractOptions, Lattice, Mesh, SurfaceAttributes, clean, extract_mesh,
+};
+use neurodin::{Error, Result};
 use proptest::prelude::*;
 
 /// A field given by a function of the position; evaluated in float64 and rounded.
@@ -248,16 +251,323 @@ fn block_size_changes_nothing() {
 }
 
 #[test]
-fn world_frame() {
-    let world_from_region =
-        DMat4::from_translation(DVec3::new(5.0, -3.0, 2.0)) * DMat4::from_scale(DVec3::splat(2.5));
-    let mesh = extract(
-        sphere,
-        &ExtractOptions {
-            resolution: 32,
+fn attributes_reach_the_world() {
+    let center = DVec3::new(0.03, -0.02, 0.01);
+    let turn = DMat4::from_axis_angle(DVec3::new(1.0, 2.0, 3.0).normalize(), 0.7);
+    for mirror in [1.0, -1.0] {
+        let world_from_region = DMat4::from_translation(DVec3::new(5e5, -3.0, 2.0))
+            * DMat4::from_scale(DVec3::new(2.5, 2.5, 2.5 * mirror))
+            * turn;
+        let options = ExtractOptions {
+            resolution: 48,
             world_from_region,
+            ..Default::default()
+        };
+        let mesh = extract(sphere, &options);
+        assert_eq!(assert_closed_manifold(&mesh), 2);
+        let world_center = world_from_region.transform_point3(center);
+        for (vertex, &p) in mesh.positions.iter().enumerate() {
+            assert!(
+                ((p - world_center).length() - 1.5).abs() < 2e-3,
+                "vertex {vertex} at {p}"
+            );
+            let normal = DVec3::from(mesh.normals[vertex].map(f64::from));
+            let expected = (p - world_center).normalize();
+            assert!(
+                normal.dot(expected) > 0.999,
+                "normal {normal} where {expected} is outward"
+            );
+            let region = world_from_region.inverse().transform_point3(p);
+            for axis in 0..3 {
+                let color = f64::from(mesh.colors[vertex][axis]) / 255.0;
+                assert!(
+                    (color - (0.5 + 0.5 * region[axis])).abs() < 3e-3,
+                    "colour {color} at {region}"
+                );
+            }
+        }
+        let volume: f64 = (0..mesh.faces.len())
+            .map(|face| {
+                mesh.area_vector(face)
+                    .dot(mesh.corners(face)[0] - world_center)
+                    / 3.0
+            })
+            .sum();
+        assert!(
+            (volume / (4.0 / 3.0 * std::f64::consts::PI * 1.5f64.powi(3)) - 1.0).abs() < 0.01,
+            "volume {volume}"
+        );
+    }
+}
+
+#[test]
+fn nothing_is_left_outside_of_the_region() {
+    let slab = |p: DVec3| p.z.abs() - 0.31;
+    let mesh = extract(
+        slab,
+        &ExtractOptions {
+            resolution: 50,
             ..Default::default()
         },
     );
-    assert_eq!(assert_closed_manifold(&mesh), 2);
+    assert!(!mesh.faces.is_empty());
+    assert!(mesh.positions.iter().all(|p| p.length() <= 1.0));
+    // Nearly up to the sphere: the cut may miss what shares a cell with the outside.
+    let area = mesh.area() / (2.0 * std::f64::consts::PI * (1.0 - 0.31f64.powi(2)));
+    assert!((0.9..=1.0).contains(&area), "{area} of the disks");
+
+    let half = DVec3::new(1.0, 0.5, 0.7);
+    let options = ExtractOptions {
+        resolution: 50,
+        domain: Domain::Box { half },
+        ..Default::default()
+    };
+    let mesh = extract(slab, &options);
+    let expected = 2.0 * 2.0 * 1.0;
+    assert!(mesh.positions.iter().all(|p| p.abs().cmple(half).all()));
+    assert!(
+        (0.9..=1.0).contains(&(mesh.area() / expected)),
+        "{} of {expected}",
+        mesh.area()
+    );
+}
+
+#[test]
+fn cropping_while_extracting_is_cropping_afterwards() {
+    let world_from_region = DMat4::from_scale_rotation_translation(
+        DVec3::splat(3.0),
+        DQuat::from_rotation_y(0.4),
+        DVec3::new(1.0, 2.0, 3.0),
+    );
+    let whole = ExtractOptions {
+        resolution: 70,
+        block: 16,
+        world_from_region,
+        ..Default::default()
+    };
+    let inner = [DVec3::new(0.2, 1.0, 1.0), DVec3::new(3.0, 4.0, 3.3)];
+    let run = |options: &ExtractOptions| {
+        let calls = Cell::new(0);
+        let field = |p: DVec3| {
+            calls.set(calls.get() + 1);
+            sphere(p)
+        };
+        let (mut mesh, _) = extract_surface(&mut Analytic(field), options, &mut |_| true).unwrap();
+        to_world(&mut mesh, options.world_from_region);
+        (mesh, calls.get())
+    };
+    let (mut expected, all_calls) = run(&whole);
+    clean::crop(&mut expected, inner);
+    let (cropped, calls) = run(&ExtractOptions {
+        crop: Some(inner),
+        ..whole
+    });
+    assert!(expected.faces.len() > 500, "{} faces", expected.faces.len());
+    assert!(sorted_faces(&cropped) == sorted_faces(&expected));
+    assert!(
+        2 * calls < all_calls,
+        "{calls} of {all_calls} values for half of the region"
+    );
+}
+
+#[test]
+fn scratch_memory_does_not_grow_with_resolution() {
+    // Blocks without surface are skipped to save time; what is held does not depend on them.
+    let stats = |resolution| {
+        let options = ExtractOptions {
+            resolution,
+            steepest: Some(1.01),
+            ..Default::default()
+        };
+        extract_surface(&mut Analytic(sphere), &options, &mut |_| true)
+            .unwrap()
+            .1
+    };
+    let (coarse, fine) = (stats(128), stats(768));
+    assert!(
+        fine.scratch_bytes as f64 <= 1.2 * coarse.scratch_bytes as f64,
+        "{} B at 128, {} B at 768",
+        coarse.scratch_bytes,
+        fine.scratch_bytes
+    );
+    assert!(fine.steepest < 1.01, "slope {}", fine.steepest);
+    assert!(fine.blocks_skipped > fine.blocks / 4, "{fine:?}");
+}
+
+#[test]
+fn skipping_blocks_changes_nothing_where_the_bound_holds() {
+    let bumpy = |p: DVec3| p.length() - 0.7 + 0.03 * (14.0 * p.x).sin() * (11.0 * p.y).sin();
+    let options = ExtractOptions {
+        resolution: 150,
+        block: 16,
+        ..Default::default()
+    };
+    let run = |steepest| {
+        let (mesh, stats) = extract_surface(
+            &mut Analytic(bumpy),
+            &ExtractOptions {
+                steepest,
+                ..options.clone()
+            },
+            &mut |_| true,
+        )
+        .unwrap();
+        (sorted_faces(&mesh), stats)
+    };
+    let (whole, _) = run(None);
+    let (skipped, stats) = run(Some(1.8));
+    assert!(
+        stats.blocks_skipped > 0 && stats.steepest < 1.8,
+        "{stats:?}"
+    );
+    assert!(skipped == whole);
+    let (_, stats) = run(Some(0.5));
+    assert!(
+        stats.steepest > 1.0,
+        "a bound that does not hold shows in the slope seen: {stats:?}"
+    );
+}
+
+/// Checks that lattice points are exact in float32.
+struct ExactPoints;
+
+impl Lattice for ExactPoints {
+    fn sdf(
+        &mut self,
+        origin: DVec3,
+        step: f64,
+        dims: [usize; 3],
+        values: &mut Vec<f32>,
+    ) -> Result<()> {
+        for axis in 0..3 {
+            for i in [0, 1, dims[axis] / 3, dims[axis] - 1] {
+                let (exact, single) = (
+                    origin[axis] + step * i as f64,
+                    origin[axis] as f32 + step as f32 * i as f32,
+                );
+                assert_eq!(
+                    exact,
+                    f64::from(single),
+                    "origin {origin}, step {step}, point {i}"
+                );
+            }
+        }
+        values.clear();
+        values.resize(dims[0] * dims[1] * dims[2], 1.0);
+        Ok(())
+    }
+}
+
+#[test]
+fn lattice_points_are_exact_in_float32() {
+    for resolution in [2, 3, 50, 97, 333, 500, 512, 513] {
+        for domain in [
+            Domain::Sphere,
+            Domain::Box {
+                half: DVec3::new(0.3, 1.0, 0.77),
+            },
+        ] {
+            let options = ExtractOptions {
+                resolution,
+                domain,
+                ..Default::default()
+            };
+            let (mesh, stats) = extract_surface(&mut ExactPoints, &options, &mut |_| true).unwrap();
+            assert!(mesh.faces.is_empty());
+            let longest = *stats.cells.iter().max().unwrap() as u32;
+            assert!(
+                (resolution..=resolution + 1).contains(&longest),
+                "{longest} cells for {resolution}"
+            );
+            let covered = stats.step * f64::from(longest);
+            assert!(
+                (2.0..2.0 * (1.0 + 2.0 / f64::from(resolution))).contains(&covered),
+                "{covered}"
+            );
+        }
+    }
+}
+
+#[test]
+fn damaged_fields_and_senseless_options_are_refused() {
+    let options = ExtractOptions {
+        resolution: 20,
+        block: 8,
+        ..Default::default()
+    };
+    let hole = |p: DVec3| {
+        if (p - DVec3::splat(0.3)).length() < 0.08 {
+            f64::NAN
+        } else {
+            sphere(p)
+        }
+    };
+    match extract_mesh(&mut Analytic(hole), &options, &mut |_| true) {
+        Err(Error::Numerical { what }) => assert!(what.contains("NaN"), "{what}"),
+        other => panic!("{other:?}"),
+    }
+    for wrong in [
+        ExtractOptions {
+            resolution: 1,
+            ..options.clone()
+        },
+        ExtractOptions {
+            resolution: 1 << 20,
+            ..options.clone()
+        },
+        ExtractOptions {
+            block: 0,
+            ..options.clone()
+        },
+        ExtractOptions {
+            domain: Domain::Box {
+                half: DVec3::new(1.0, 0.0, 1.0),
+            },
+            ..options.clone()
+        },
+        ExtractOptions {
+            domain: Domain::Box {
+                half: DVec3::new(1.0, f64::NAN, 1.0),
+            },
+            ..options.clone()
+        },
+    ] {
+        assert!(
+            matches!(
+                extract_mesh(&mut Analytic(sphere), &wrong, &mut |_| true),
+                Err(Error::Config { .. })
+            ),
+            "{wrong:?}"
+        );
+    }
+}
+
+#[test]
+fn progress_reaches_the_end_and_can_stop() {
+    let options = ExtractOptions {
+        resolution: 40,
+        block: 10,
+        ..Default::default()
+    };
+    let mut last = HashMap::new();
+    extract_mesh(&mut Analytic(sphere), &options, &mut |p| {
+        let before = last
+            .insert(format!("{:?}", p.stage), (p.done, p.total))
+            .unwrap_or((0, p.total));
+        assert!(p.done > before.0 && p.total == before.1);
+        true
+    })
+    .unwrap();
+    assert_eq!(last.len(), 2);
+    assert!(last.values().all(|(done, total)| done == total), "{last:?}");
+
+    let mut blocks = 0;
+    let stopped = extract_mesh(&mut Analytic(sphere), &options, &mut |_| {
+        blocks += 1;
+        blocks < 5
+    });
+    assert!(
+        matches!(stopped, Err(Error::Interrupted { .. })) && blocks == 5,
+        "{blocks} blocks"
+    );
 }

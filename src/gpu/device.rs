@@ -3,9 +3,10 @@
 //! Needed: Vulkan 1.2 with buffer device addresses, scalar block layout and timeline semaphores, and the subgroup operations that
 //! lib/prelude.glsl names. Used where present: float atomics, 64-bit integers, full subgroups, memory budgets, debug names.
 
-use super::buffer::Memory;
 use super::kernel::Pipelines;
+use super::memory::Memory;
 use super::queue::Queue;
+use super::validation::{self, Settings, ValidationLog};
 use crate::{Error, Result};
 use ash::{ext, khr, vk};
 use std::ffi::CStr;
@@ -104,6 +105,7 @@ pub(super) struct Context {
     pub(super) debug: Option<ext::debug_utils::Device>,
     pub(super) queue: vk::Queue,
     pub(super) family: u32,
+    pub(super) has_memory_budget: bool,
     pub(super) instance: Instance,
 }
 
@@ -114,17 +116,24 @@ impl Drop for Context {
     }
 }
 
-/// Loader and instance.
+/// Loader and instance, and under validation the messenger.
 pub(super) struct Instance {
+    messenger: Option<(ext::debug_utils::Instance, vk::DebugUtilsMessengerEXT)>,
     pub(super) raw: ash::Instance,
+    pub(super) log: ValidationLog,
     has_debug_utils: bool,
-    _entry: ash::Entry,
+    entry: ash::Entry,
 }
 
 impl Drop for Instance {
     fn drop(&mut self) {
-        // SAFETY: the device made from it is gone.
-        unsafe { self.raw.destroy_instance(None) };
+        // SAFETY: the device made from the instance is gone.
+        unsafe {
+            if let Some((debug, messenger)) = self.messenger.take() {
+                debug.destroy_debug_utils_messenger(messenger, None);
+            }
+            self.raw.destroy_instance(None);
+        }
     }
 }
 
@@ -137,7 +146,7 @@ impl std::fmt::Debug for Gpu {
 impl Gpu {
     /// Opens a device. Fails with [`Error::NoDevice`] where there is no Vulkan, no device of that name, or none that can run the kernels.
     pub fn new(options: &GpuOptions) -> Result<Gpu> {
-        let instance = Instance::new(options)?;
+        let instance = Instance::new(options.validation)?;
         let devices = instance.devices()?;
         let chosen = choose(&devices, options.device.as_deref())?;
         let (physical, info) = devices.into_iter().nth(chosen).expect("chosen from these");
@@ -160,7 +169,7 @@ impl Gpu {
 
     /// All devices that drivers offer, also those that cannot run the kernels ([`DeviceInfo::missing`]).
     pub fn list() -> Result<Vec<DeviceInfo>> {
-        let instance = Instance::new(&GpuOptions::default())?;
+        let instance = Instance::new(false)?;
         Ok(instance
             .devices()?
             .into_iter()
@@ -171,6 +180,16 @@ impl Gpu {
     /// The device in use.
     pub fn info(&self) -> &DeviceInfo {
         &self.inner.info
+    }
+
+    /// What the validation layer has said so far; nothing where the device was opened without [`GpuOptions::validation`].
+    pub fn validation_messages(&self) -> Vec<String> {
+        self.validation_log().messages()
+    }
+
+    /// The layer's log, which outlives the device: what was leaked is reported when the device goes.
+    pub fn validation_log(&self) -> ValidationLog {
+        self.inner.context.instance.log.clone()
     }
 
     /// How it was opened.
@@ -253,7 +272,7 @@ fn choose(devices: &[(vk::PhysicalDevice, DeviceInfo)], wanted: Option<&str>) ->
 }
 
 impl Instance {
-    fn new(_options: &GpuOptions) -> Result<Instance> {
+    fn new(validate: bool) -> Result<Instance> {
         // SAFETY: loading the Vulkan loader runs its initialisers, as every Vulkan program does.
         let entry = unsafe { ash::Entry::load() }.map_err(|error| Error::NoDevice {
             what: format!("no Vulkan loader: {error}\n  next: install a Vulkan driver (Debian, Ubuntu: libvulkan1 and mesa-vulkan-drivers)"),
@@ -271,30 +290,66 @@ impl Instance {
                 .iter()
                 .any(|e| e.extension_name_as_c_str() == Ok(name))
         };
+        let settings = match validate {
+            true => Settings::find(&entry)?,
+            false => Settings::Neither,
+        };
         let mut extensions = Vec::new();
         let mut flags = vk::InstanceCreateFlags::empty();
         if offers(khr::portability_enumeration::NAME) {
             extensions.push(khr::portability_enumeration::NAME.as_ptr());
             flags |= vk::InstanceCreateFlags::ENUMERATE_PORTABILITY_KHR;
         }
-        let has_debug_utils = offers(ext::debug_utils::NAME);
+        // The layer brings debug_utils where the loader does not.
+        let has_debug_utils = validate || offers(ext::debug_utils::NAME);
         if has_debug_utils {
             extensions.push(ext::debug_utils::NAME.as_ptr());
         }
+        extensions.extend(settings.extension().map(CStr::as_ptr));
+
+        let layers = [validation::LAYER.as_ptr()];
+        let log = ValidationLog::default();
+        let mut early = validation::messenger(&log);
+        let mut features =
+            vk::ValidationFeaturesEXT::default().enabled_validation_features(&validation::FEATURES);
+        let named = validation::layer_settings();
+        let mut layer_settings = vk::LayerSettingsCreateInfoEXT::default().settings(&named);
         let application = vk::ApplicationInfo::default()
             .application_name(c"neurodin")
             .api_version(vk::API_VERSION_1_3);
-        let create = vk::InstanceCreateInfo::default()
+        let mut create = vk::InstanceCreateInfo::default()
             .flags(flags)
             .application_info(&application)
             .enabled_extension_names(&extensions);
-        // SAFETY: every pointer in `create` outlives the call.
+        if validate {
+            create = create.enabled_layer_names(&layers).push_next(&mut early);
+        }
+        match settings {
+            Settings::LayerSettings => create = create.push_next(&mut layer_settings),
+            Settings::ValidationFeatures => create = create.push_next(&mut features),
+            Settings::Neither => {}
+        }
+        // SAFETY: every pointer in `create` outlives the call; `log` outlives the instance.
         let raw = unsafe { entry.create_instance(&create, None) }.map_err(no_instance)?;
-        Ok(Instance {
+        let mut instance = Instance {
+            messenger: None,
             raw,
+            log,
             has_debug_utils,
-            _entry: entry,
-        })
+            entry,
+        };
+        if validate {
+            let debug = ext::debug_utils::Instance::new(&instance.entry, &instance.raw);
+            // SAFETY: a live instance; `log` outlives the messenger.
+            let made = unsafe {
+                debug.create_debug_utils_messenger(&validation::messenger(&instance.log), None)
+            };
+            instance.messenger = Some((
+                debug,
+                made.map_err(vulkan("vkCreateDebugUtilsMessengerEXT"))?,
+            ));
+        }
+        Ok(instance)
     }
 
     fn devices(&self) -> Result<Vec<(vk::PhysicalDevice, DeviceInfo)>> {
@@ -492,7 +547,8 @@ impl Context {
         if info.full_subgroups.is_some() && !size_control_is_core {
             names.push(ext::subgroup_size_control::NAME.as_ptr());
         }
-        if offers(ext::memory_budget::NAME) {
+        let has_memory_budget = offers(ext::memory_budget::NAME);
+        if has_memory_budget {
             names.push(ext::memory_budget::NAME.as_ptr());
         }
         if offers(khr::portability_subset::NAME) {
@@ -537,6 +593,7 @@ impl Context {
             debug,
             queue,
             family,
+            has_memory_budget,
             instance,
         })
     }

@@ -26,14 +26,18 @@
 mod buffer;
 mod device;
 mod kernel;
+mod memory;
 mod queue;
 mod recorder;
 #[cfg(test)]
 mod reflect;
 mod transfer;
+mod validation;
 
 pub use buffer::{Buffer, Ptr, PtrMut, Readback};
 pub use device::{DeviceInfo, DeviceKind, Gpu, GpuOptions};
 pub use kernel::{Kernel, KernelModule, KernelShape, PointerArg};
+pub use memory::{MemoryPlan, Overrun};
 pub use queue::Ticket;
 pub use recorder::{Recorder, Work};
+pub use validation::ValidationLog;

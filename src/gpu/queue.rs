@@ -1,7 +1,7 @@
 //! Submission: one compute queue, one timeline semaphore that counts submissions, two calls of `submit` in flight.
 
-use super::buffer::{Memory, Parts};
 use super::device::{Context, Gpu, vulkan};
+use super::memory::{Memory, Parts};
 use super::recorder::{Hazards, Recorder};
 use crate::Result;
 use ash::vk;

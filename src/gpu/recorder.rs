@@ -4,9 +4,10 @@
 //! (min(groups, 256), ⌈groups / 256⌉, slices), since one dimension ends at 65535. Submissions are cut by estimated time, because a
 //! watchdog ends what runs for seconds; one large launch is itself cut along its rows.
 
-use super::buffer::{Buffer, Slab};
+use super::buffer::Buffer;
 use super::device::{DeviceKind, Gpu, vulkan};
 use super::kernel::Kernel;
+use super::memory::Slab;
 use super::queue::QueueState;
 use crate::{Error, Result};
 use ash::vk;
@@ -511,5 +512,42 @@ impl<'a> Recorder<'a> {
         };
         // SAFETY: an open command buffer with an open label.
         unsafe { debug.cmd_end_debug_utils_label(commands) };
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gpu::GpuOptions;
+
+    #[test]
+    fn synchronisation_checks_see_a_missing_barrier() -> Result<()> {
+        let options = GpuOptions {
+            validation: true,
+            ..GpuOptions::default()
+        };
+        let gpu = Gpu::new(&options)?;
+        let words = gpu.buffer::<u32>("words", 64)?;
+        let fill_twice = |forget: bool| {
+            gpu.submit("twice", |rec| {
+                rec.fill(&words, 0..64, 1);
+                if forget {
+                    rec.state.hazards.clear();
+                }
+                rec.fill(&words, 0..64, 2);
+                Ok(())
+            })
+        };
+        fill_twice(false)?;
+        assert_eq!(gpu.validation_messages(), Vec::<String>::new());
+        fill_twice(true)?;
+        let said = gpu.validation_messages();
+        assert!(
+            said.iter().any(
+                |text| text.contains("WRITE-AFTER-WRITE") || text.contains("WRITE_AFTER_WRITE")
+            ),
+            "{said:?}"
+        );
+        Ok(())
     }
 }

@@ -215,9 +215,8 @@ pub fn extract_surface(
                 done += 1;
                 report(progress, Stage::Lattice, done, stats.blocks, &sink.mesh)?;
             }
+            sink.forget_passed(block_y, block_z);
         }
-        let top = ((block_z + 1) * options.block).min(grid.cells[2]);
-        sink.borders.retain(|edge, _| edge.point[2] as usize == top);
     }
     let mut mesh = sink.mesh;
     super::clean::drop_unused_vertices(&mut mesh);
@@ -441,7 +440,7 @@ struct BlockSink<'a> {
     grid: &'a Grid,
     first: [usize; 3],
     last: [usize; 3],
-    /// Vertices on the sides of blocks, of this slab of blocks and the top of the one below.
+    /// Vertices on the sides of blocks, as far as blocks still to come may ask for them.
     borders: HashMap<Edge, u32>,
     mesh: Mesh,
 }
@@ -460,6 +459,16 @@ impl<'a> BlockSink<'a> {
 
     fn begin(&mut self, first: [usize; 3], last: [usize; 3]) {
         (self.first, self.last) = (first, last);
+    }
+
+    /// Drops border vertices that no block after this row can ask for.
+    fn forget_passed(&mut self, block_y: usize, block_z: usize) {
+        let end = |block: usize, axis: usize| {
+            ((block + 1) * self.options.block).min(self.grid.cells[axis]) as u32
+        };
+        let (row_end, slab_end) = (end(block_y, 1), end(block_z, 2));
+        self.borders
+            .retain(|edge, _| edge.point[2] == slab_end || edge.point[1] >= row_end);
     }
 
     fn border_bytes(&self) -> usize {

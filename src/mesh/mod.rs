@@ -3,10 +3,13 @@
 //! A [`Mesh`] is in the world frame of the input cameras unless said otherwise. Faces wind counter-clockwise seen from free space
 //! (where the signed distance is positive), so that their right-hand normals point outward.
 
+pub mod bvh;
 pub mod clean;
 pub mod extract;
 pub mod field;
 pub mod marching_cubes;
+pub mod read;
+pub mod visibility;
 pub mod write;
 
 use glam::DVec3;
@@ -15,6 +18,7 @@ pub use extract::{
     Domain, ExtractOptions, ExtractStats, Lattice, Progress, SurfaceAttributes, extract_mesh,
 };
 pub use field::Field;
+pub use read::read_mesh;
 pub use write::{MeshFormat, write_mesh};
 
 /// Triangles with optional normals and colours per vertex. Without faces it is a point cloud.

@@ -11,8 +11,8 @@ mod camera;
 mod colmap;
 mod images;
 mod points;
+mod preview;
 pub mod synthetic;
-
 mod transforms;
 
 use std::collections::HashSet;
@@ -24,9 +24,10 @@ use serde::{Deserialize, Serialize};
 
 use crate::{Error, Result};
 
-pub use bounds::{Region, RegionOverrides, RegionShape};
+pub use bounds::{Facing, Looks, Region, RegionOverrides, RegionShape};
 pub use camera::{Camera, CameraModel, UNSUPPORTED_MODELS};
 pub use images::Picture;
+pub use preview::write_preview;
 
 /// A dataset: posed views, sparse points where it has any, and what its author said of the region.
 #[derive(Clone, Debug)]
@@ -177,7 +178,8 @@ struct Frame {
     name: String,
     /// The picture, or where it was looked for.
     image: std::result::Result<PathBuf, String>,
-    mask: Option<PathBuf>,
+    /// The mask that the dataset names, or where it was looked for.
+    mask: Option<std::result::Result<PathBuf, String>>,
     lens: FrameLens,
     world_from_camera: DMat4,
     split: Option<Split>,
@@ -256,12 +258,17 @@ impl Scene {
             } else {
                 camera.scaled(reduced(camera.width), reduced(camera.height))
             };
-            let mask_path = if options.masks {
-                frame
-                    .mask
-                    .or_else(|| images::find_mask(&scene.root, &image_path))
-            } else {
-                None
+            let mask_path = match frame.mask {
+                _ if !options.masks => None,
+                Some(Ok(path)) => Some(path),
+                Some(Err(why)) => {
+                    return Err(Error::input(
+                        &reading.file,
+                        format!("the mask of {}: {why}", frame.name),
+                        "put the mask there, take its mask_path out of the file, or do without masks (--no-masks)",
+                    ));
+                }
+                None => images::find_mask(&scene.root, &image_path),
             };
             scene.views.push(View {
                 name: frame.name,

@@ -1,0 +1,236 @@
+//! `neurodin inspect`: what a dataset holds, what was left out and why, and the region that would be reconstructed.
+
+use std::collections::BTreeMap;
+use std::fmt::Write as _;
+use std::path::PathBuf;
+
+use clap::Args;
+use serde_json::{Value, json};
+
+use super::scene_args::SceneArgs;
+use crate::Error;
+use crate::scene::{
+    Facing, Looks, Region, RegionOverrides, RegionShape, Scene, SceneOptions, Split, write_preview,
+};
+
+/// Say what a dataset holds, what was skipped, and which region would be reconstructed
+#[derive(Args, Clone, Debug)]
+#[command(after_help = "Examples:
+  neurodin inspect photos/
+  neurodin inspect photos/ --preview preview.ply
+  neurodin inspect photos/ --center 0,0,0.6 --radius 1.35 --json")]
+pub struct InspectArgs {
+    /// Directory of the dataset, a transforms.json, or the directory of a COLMAP model
+    pub dataset: PathBuf,
+    /// Write cameras, points and region to this PLY file
+    #[arg(long, value_name = "FILE")]
+    pub preview: Option<PathBuf>,
+    /// Replace the preview if it exists
+    #[arg(long)]
+    pub force: bool,
+    /// Print the report as JSON
+    #[arg(long)]
+    pub json: bool,
+    #[command(flatten)]
+    pub scene: SceneArgs,
+}
+
+/// Opens the dataset, prints the report on stdout and writes the preview.
+pub fn run(args: &InspectArgs) -> anyhow::Result<()> {
+    if let Some(preview) = args
+        .preview
+        .as_ref()
+        .filter(|preview| preview.exists() && !args.force)
+    {
+        return Err(Error::Output {
+            path: preview.clone(),
+            what: "exists already".into(),
+            next: "name another file, or replace it with --force".into(),
+        }
+        .into());
+    }
+    let scene = Scene::open(&args.dataset, &args.scene.options(&SceneOptions::default()))?;
+    let looks = Looks::of(&scene);
+    let region = Region::estimate(&scene, &args.scene.overrides(&RegionOverrides::default()))?;
+    if let Some(preview) = &args.preview {
+        write_preview(&scene, &region, preview)?;
+    }
+    let report = report(&scene, &looks, &region, args.preview.as_ref());
+    if args.json {
+        println!("{}", serde_json::to_string_pretty(&report)?);
+    } else {
+        print!(
+            "{}",
+            as_text(&scene, &looks, &region, args.preview.as_ref())
+        );
+    }
+    Ok(())
+}
+
+/// Views counted by the model and size of their cameras.
+fn cameras(scene: &Scene) -> BTreeMap<(&'static str, u32, u32), usize> {
+    let mut counts = BTreeMap::new();
+    for view in &scene.views {
+        let camera = &view.camera;
+        *counts
+            .entry((camera.model.name(), camera.width, camera.height))
+            .or_default() += 1;
+    }
+    counts
+}
+
+/// What a reader of the report should do something about.
+fn warnings(scene: &Scene, looks: &Looks, region: &Region) -> Vec<String> {
+    let mut warnings = Vec::new();
+    let train = scene.split(Split::Train).count();
+    if train < 20 {
+        warnings.push(format!(
+            "only {train} training views: surfaces that few of them see will be guesses"
+        ));
+    }
+    let inside = region.cameras_inside(scene);
+    if looks.facing == Facing::Outward && inside < scene.views.len() {
+        let outside = scene.views.len() - inside;
+        warnings.push(format!(
+            "the cameras look outwards, but {outside} of {} stand outside the region: enlarge it (--region-scale, --radius)",
+            scene.views.len()
+        ));
+    }
+    let points = region.points_inside(scene);
+    if !scene.points.is_empty() && points * 5 < scene.points.len() {
+        warnings.push(format!(
+            "only {points} of {} points lie inside the region: look at the preview (--preview FILE)",
+            scene.points.len()
+        ));
+    }
+    let seeing = scene
+        .views
+        .iter()
+        .filter(|view| view.sees(region.center).is_some())
+        .count();
+    if looks.facing == Facing::Inward && seeing * 2 < scene.views.len() {
+        warnings.push(format!(
+            "the region's centre is in {seeing} of {} pictures only",
+            scene.views.len()
+        ));
+    }
+    warnings
+}
+
+/// Presets for scenes that are looked at from where these cameras stand.
+fn suggestion(facing: Facing) -> &'static str {
+    match facing {
+        Facing::Inward => "outdoor",
+        Facing::Outward => "indoor",
+    }
+}
+
+fn report(scene: &Scene, looks: &Looks, region: &Region, preview: Option<&PathBuf>) -> Value {
+    let cameras: Vec<Value> = cameras(scene)
+        .into_iter()
+        .map(|((model, width, height), views)| json!({"model": model, "width": width, "height": height, "views": views}))
+        .collect();
+    json!({
+        "root": scene.root,
+        "format": scene.format,
+        "views": {
+            "train": scene.split(Split::Train).count(),
+            "test": scene.split(Split::Test).count(),
+            "masked": scene.views.iter().filter(|view| view.mask_path.is_some()).count(),
+        },
+        "cameras": cameras,
+        "points": scene.points.len(),
+        "looks": looks,
+        "presets": suggestion(looks.facing),
+        "region": region,
+        "inside": {
+            "cameras": region.cameras_inside(scene),
+            "points": region.points_inside(scene),
+        },
+        "skipped": scene.skipped,
+        "notes": scene.notes,
+        "warnings": warnings(scene, looks, region),
+        "preview": preview,
+    })
+}
+
+fn as_text(scene: &Scene, looks: &Looks, region: &Region, preview: Option<&PathBuf>) -> String {
+    let mut text = String::new();
+    let mut row = |name: &str, value: String| {
+        let _ = writeln!(text, "{name:<10} {value}");
+    };
+    let (train, test) = (
+        scene.split(Split::Train).count(),
+        scene.split(Split::Test).count(),
+    );
+    let masked = scene
+        .views
+        .iter()
+        .filter(|view| view.mask_path.is_some())
+        .count();
+    row(
+        "dataset",
+        format!("{}, {}", scene.root.display(), scene.format),
+    );
+    row(
+        "views",
+        format!("{train} to train on, {test} held out, {masked} with masks"),
+    );
+    for ((model, width, height), views) in cameras(scene) {
+        row("camera", format!("{model} {width}x{height}, {views} views"));
+    }
+    row("points", format!("{}", scene.points.len()));
+    let (facing, why) = match looks.facing {
+        Facing::Inward => ("inwards, at an object or building", &looks.why),
+        Facing::Outward => ("outwards, from within a room", &looks.why),
+    };
+    row("look", format!("{facing}: {why}"));
+    row(
+        "",
+        format!(
+            "presets for such scenes begin with {}-",
+            suggestion(looks.facing)
+        ),
+    );
+    let (center, radius) = (region.center, region.radius);
+    let shape = match region.shape {
+        RegionShape::Sphere => format!("sphere, radius {radius:.6}"),
+        RegionShape::Box { half } => format!("box, half extents {:.6}", half * radius),
+    };
+    row("region", format!("{shape}, centre {center:.6}"));
+    row("", format!("from {}", region.how));
+    row(
+        "inside",
+        format!(
+            "{} of {} cameras, {} of {} points",
+            region.cameras_inside(scene),
+            scene.views.len(),
+            region.points_inside(scene),
+            scene.points.len()
+        ),
+    );
+    // A long list of the same reason is said once.
+    const LISTED: usize = 10;
+    for skipped in scene.skipped.iter().take(LISTED) {
+        row("skipped", format!("{}: {}", skipped.what, skipped.why));
+    }
+    if scene.skipped.len() > LISTED {
+        row(
+            "",
+            format!(
+                "and {} more; --json lists them all",
+                scene.skipped.len() - LISTED
+            ),
+        );
+    }
+    for note in &scene.notes {
+        row("note", note.clone());
+    }
+    for warning in warnings(scene, looks, region) {
+        row("warning", warning);
+    }
+    if let Some(preview) = preview {
+        row("preview", format!("{}", preview.display()));
+    }
+    text
+}

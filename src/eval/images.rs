@@ -1,0 +1,103 @@
+//! PSNR and SSIM of pictures with values in [0, 1].
+//!
+//! PSNR = −10 log₁₀ MSE. SSIM (Wang, Bovik, Sheikh & Simoncelli 2004) with an 11×11 Gaussian window of σ = 1.5, K₁ = 0.01, K₂ = 0.03,
+//! over the windows that lie inside the picture, per channel, then the mean of the channels.
+
+/// Mean squared difference. Any shape.
+///
+/// # Panics
+/// If the lengths differ or are zero.
+pub fn mean_squared_error(a: &[f32], b: &[f32]) -> f64 {
+    assert_eq!(a.len(), b.len(), "pictures of different size");
+    assert!(!a.is_empty(), "empty pictures");
+    let squares = a
+        .iter()
+        .zip(b)
+        .map(|(&a, &b)| (f64::from(a) - f64::from(b)).powi(2));
+    squares.sum::<f64>() / a.len() as f64
+}
+
+/// Peak signal-to-noise ratio in dB; infinite for equal pictures.
+///
+/// # Panics
+/// If the lengths differ or are zero.
+pub fn psnr(a: &[f32], b: &[f32]) -> f64 {
+    -10.0 * mean_squared_error(a, b).log10()
+}
+
+const RADIUS: usize = 5;
+const SIGMA: f64 = 1.5;
+
+/// Structural similarity of two pictures `[height, width, channels]`; `None` if a window does not fit into them.
+///
+/// # Panics
+/// If the slices are not `width · height · channels` long.
+pub fn ssim(a: &[f32], b: &[f32], width: usize, height: usize, channels: usize) -> Option<f64> {
+    assert_eq!(
+        (a.len(), b.len()),
+        (width * height * channels, width * height * channels),
+        "pictures of the stated size"
+    );
+    if width.min(height) <= 2 * RADIUS || channels == 0 {
+        return None;
+    }
+    let (c1, c2) = (0.01f64.powi(2), 0.03f64.powi(2));
+    let window = window();
+    let channel_mean = |channel: usize| {
+        let plane = |picture: &[f32]| -> Vec<f64> {
+            picture
+                .iter()
+                .skip(channel)
+                .step_by(channels)
+                .map(|&x| f64::from(x))
+                .collect()
+        };
+        let (a, b) = (plane(a), plane(b));
+        let blurred = |f: &dyn Fn(f64, f64) -> f64| {
+            let product: Vec<f64> = a.iter().zip(&b).map(|(&a, &b)| f(a, b)).collect();
+            blur(&product, width, height, &window)
+        };
+        let mean_a = blurred(&|a, _| a);
+        let mean_b = blurred(&|_, b| b);
+        let square_a = blurred(&|a, _| a * a);
+        let square_b = blurred(&|_, b| b * b);
+        let product = blurred(&|a, b| a * b);
+        let total: f64 = (0..mean_a.len())
+            .map(|i| {
+                let (ma, mb) = (mean_a[i], mean_b[i]);
+                let (variance_a, variance_b, covariance) = (
+                    square_a[i] - ma * ma,
+                    square_b[i] - mb * mb,
+                    product[i] - ma * mb,
+                );
+                (2.0 * ma * mb + c1) * (2.0 * covariance + c2)
+                    / ((ma * ma + mb * mb + c1) * (variance_a + variance_b + c2))
+            })
+            .sum();
+        total / mean_a.len() as f64
+    };
+    Some((0..channels).map(channel_mean).sum::<f64>() / channels as f64)
+}
+
+fn window() -> [f64; 2 * RADIUS + 1] {
+    let weights: [f64; 2 * RADIUS + 1] = std::array::from_fn(|i| {
+        (-(i as f64 - RADIUS as f64).powi(2) / (2.0 * SIGMA * SIGMA)).exp()
+    });
+    let sum: f64 = weights.iter().sum();
+    weights.map(|weight| weight / sum)
+}
+
+/// Weighted means over the windows that fit: `[height − 2 RADIUS, width − 2 RADIUS]`.
+fn blur(plane: &[f64], width: usize, height: usize, window: &[f64]) -> Vec<f64> {
+    let dot =
+        |values: &mut dyn Iterator<Item = f64>| values.zip(window).map(|(x, w)| x * w).sum::<f64>();
+    let out_width = width - 2 * RADIUS;
+    let rows: Vec<f64> = plane
+        .chunks_exact(width)
+        .flat_map(|row| row.windows(window.len()))
+        .map(|values| dot(&mut values.iter().copied()))
+        .collect();
+    (0..(height - 2 * RADIUS) * out_width)
+        .map(|at| dot(&mut rows[at..].iter().step_by(out_width).copied()))
+        .collect()
+}

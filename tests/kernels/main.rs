@@ -1,0 +1,7 @@
+//! Every kernel against a slow twin in float64, and against arrays of the published implementation.
+
+mod harness;
+mod volume;
+mod volume_golden;
+mod volume_rays;
+mod volume_twin;
