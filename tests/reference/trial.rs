@@ -5,6 +5,7 @@ use super::batch::{Draws, Now, Rays, Step, StepConfig};
 use super::hash_grid::Grid;
 use super::losses::BiasReduction;
 use super::sampling::Region;
+use super::tape::ReluEdge;
 use std::collections::BTreeMap;
 use std::f64::consts::{PI, TAU};
 
@@ -115,6 +116,7 @@ pub fn parameters(
                     .map(|_| mean * (1.0 + random.symmetric(0.1)))
                     .collect()
             }
+            "surface.hidden.bias" => (0..cols).map(|_| random.symmetric(0.02)).collect(),
             "surface.heads.bias" => (0..cols)
                 .map(|_| -0.5 * side + random.symmetric(0.02))
                 .collect(),
@@ -199,5 +201,7 @@ pub fn step(config: StepConfig, n: usize, seed: u64) -> Step {
         draws,
         now,
         edges: None,
+        points: None,
+        relu_edge: ReluEdge::default(),
     }
 }

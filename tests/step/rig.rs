@@ -1,10 +1,11 @@
 //! A trainer on the device beside the twin of its configuration, and the way of numbers between the two.
 
 use crate::reference::background::{Background, FieldConfig};
-use crate::reference::batch::{Draws, Rays, StepConfig};
+use crate::reference::batch::{Draws, Rays, Step, StepConfig};
 use crate::reference::hash_grid::{Grid, Level};
 use crate::reference::losses;
 use crate::reference::sampling::{self, Stretch};
+use crate::reference::tape::ReluEdge;
 use neurodin::Result;
 use neurodin::config::{BackgroundKind, BiasReduction, Config};
 use neurodin::gpu::{Buffer, Gpu, GpuOptions};
@@ -211,6 +212,12 @@ impl Rig {
         self.draws()
     }
 
+    /// The surface's points, samples and taps.
+    pub fn points(&self) -> Result<Vec<[f64; 3]>> {
+        let points = &self.trainer.renderer().surface.points;
+        Ok(interleaved(&self.download(points)?))
+    }
+
     /// Normalised edges of all three levels.
     pub fn edges(&self) -> Result<[Vec<f64>; 3]> {
         let of = |level: usize| self.download(self.trainer.renderer().sampler.edges_of(level));
@@ -319,6 +326,47 @@ pub fn planar<const C: usize>(vectors: &[[f64; C]]) -> Vec<f64> {
     (0..C)
         .flat_map(|c| vectors.iter().map(move |v| v[c]))
         .collect()
+}
+
+/// The twin's gradients with the slope of every ReLU near its edge taken as 0, and as 1.
+pub struct GradientRange([BTreeMap<String, Vec<f64>>; 2]);
+
+impl GradientRange {
+    pub fn of(step: &Step) -> GradientRange {
+        let with = |slope: f64| {
+            let relu_edge = ReluEdge {
+                margin: 1e-6,
+                slope,
+            };
+            Step {
+                relu_edge,
+                ..step.clone()
+            }
+            .run()
+            .gradients
+        };
+        GradientRange([with(0.0), with(1.0)])
+    }
+
+    /// Relative L2 distance of at most 1e-4 and a cosine of at least 0.99999 to the nearest gradient in range.
+    #[track_caller]
+    pub fn check(&self, span: &str, device: &[f64]) {
+        let [a, b] = [&self.0[0][span], &self.0[1][span]];
+        assert_eq!(device.len(), a.len(), "{span}");
+        let range = a.iter().zip(b).zip(device);
+        let nearest: Vec<f64> = range
+            .map(|((a, b), x)| x.clamp(a.min(*b), a.max(*b)))
+            .collect();
+        let (distance, cosine) = agreement(device, &nearest);
+        println!(
+            "{span}: relative L2 {distance:.1e}, 1 - cosine {:.1e}",
+            1.0 - cosine
+        );
+        assert!(
+            distance <= 1e-4 && cosine >= 0.99999,
+            "{span}: relative L2 {distance:.2e}, cosine {cosine}"
+        );
+    }
 }
 
 /// ‖ours − theirs‖/‖theirs‖ and the cosine between the two.
