@@ -88,5 +88,5 @@ fn published_step() -> Result<()> {
             "{span}: relative L2 {distance:.2e}, cosine {cosine}"
         );
     }
-    Ok(())
+    rig.check_device()
 }

@@ -24,7 +24,7 @@ pub struct Rig {
 }
 
 impl Rig {
-    /// A trainer on a few small pictures of the built-in scene, with guard words and poisoned scratch memory.
+    /// A trainer on a few small pictures of the built-in scene, under the validation layer, with guard words and poisoned scratch.
     pub fn new(config: Config, shape: RegionShape) -> Result<Rig> {
         let folder = tempfile::tempdir().expect("a temporary folder");
         let root = folder.path().join("scene");
@@ -46,6 +46,7 @@ impl Rig {
         let config = config.validated()?;
         let gpu = Gpu::new(&GpuOptions {
             guard: true,
+            validation: true,
             ..GpuOptions::default()
         })?;
         let trainer = Trainer::new(&gpu, &scene, &region, &config)?;
@@ -57,6 +58,16 @@ impl Rig {
             twin,
             _folder: folder,
         })
+    }
+
+    /// Nothing was written behind the end of a buffer, and the validation layer has nothing to say.
+    pub fn check_device(&self) -> Result<()> {
+        self.gpu.finish()?;
+        let overruns = self.gpu.check_guards()?;
+        assert!(overruns.is_empty(), "written past the end: {overruns:?}");
+        let messages = self.gpu.validation_messages();
+        assert!(messages.is_empty(), "{}", messages.join("\n"));
+        Ok(())
     }
 
     pub fn n_rays(&self) -> usize {

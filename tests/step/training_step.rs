@@ -128,7 +128,8 @@ fn check(config: Config, shape: RegionShape, seed: u64) -> Result<()> {
     let twin = step.run();
     check_images(&rig, &twin)?;
     check_losses(&twin, &losses);
-    check_update(&rig, &GradientRange::of(&step), &params, [&m0, &v0], &now)
+    check_update(&rig, &GradientRange::of(&step), &params, [&m0, &v0], &now)?;
+    rig.check_device()
 }
 
 /// Rays meet the region where the twin's do.
