@@ -1,5 +1,5 @@
 //! Module cli.
 
+pub mod demo;
 pub mod inspect;
 pub mod scene_args;
-pub mod demo;
