@@ -41,6 +41,12 @@ macro_rules! pointer {
                 write!(f, "{}({:#x})", stringify!($name), self.address())
             }
         }
+        /// As GLSL's uvec2: for structures that hold addresses as numbers.
+        impl<T> From<$name<T>> for [u32; 2] {
+            fn from(pointer: $name<T>) -> Self {
+                pointer.words
+            }
+        }
         // SAFETY: two words and nothing else; any bits are a value, whatever T is.
         unsafe impl<T> Zeroable for $name<T> {}
         // SAFETY: as above, without padding; T is only a mark.

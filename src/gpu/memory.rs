@@ -4,7 +4,8 @@
 //! once more with an empty mask, and its uniform loads are not masked), and guard mode writes its words there. Memory whose last handle
 //! goes while submitted work may still use it waits for that work ([`super::queue`]).
 
-use super::device::{Context, DeviceInfo, DeviceKind, Gpu, Inner, vulkan};
+use super::device::{Context, Gpu, Inner, vulkan};
+use super::instance::{DeviceInfo, DeviceKind};
 use crate::{Error, Result};
 use ash::vk;
 use gpu_allocator::MemoryLocation;
@@ -150,11 +151,13 @@ pub(super) struct Memory {
     next_id: AtomicU64,
     /// Host memory that was free when the device was opened: the budget of a device that computes on the CPU.
     host_bytes: Option<u64>,
+    /// What the caller allows.
+    limit: Option<u64>,
     device: ash::Device,
 }
 
 impl Memory {
-    pub(super) fn new(context: &Context) -> Result<Memory> {
+    pub(super) fn new(context: &Context, limit: Option<u64>) -> Result<Memory> {
         let allocator = Allocator::new(&AllocatorCreateDesc {
             instance: context.instance.raw.clone(),
             device: context.device.clone(),
@@ -172,6 +175,7 @@ impl Memory {
             staging: Mutex::new(None),
             next_id: AtomicU64::new(1),
             host_bytes: available_host_memory(),
+            limit,
             device: context.device.clone(),
         })
     }
@@ -292,14 +296,21 @@ impl Memory {
 
     /// (all that this program may use on the device, what is left of it) in bytes.
     fn budget(&self, context: &Context, info: &DeviceInfo) -> (u64, u64) {
-        let held: u64 = self
-            .live
-            .read()
-            .expect("no panic under the lock")
+        let live = self.live.read().expect("no panic under the lock");
+        let held: u64 = live
             .values()
-            .filter(|s| s.on_device)
-            .map(|s| s.size)
+            .filter(|span| span.on_device)
+            .map(|span| span.size)
             .sum();
+        drop(live);
+        let (total, left) = self.device_budget(context, info, held);
+        match self.limit {
+            Some(limit) => (total.min(limit), left.min(limit.saturating_sub(held))),
+            None => (total, left),
+        }
+    }
+
+    fn device_budget(&self, context: &Context, info: &DeviceInfo, held: u64) -> (u64, u64) {
         if let (DeviceKind::Cpu, Some(total)) = (info.kind, self.host_bytes) {
             // Heap sizes of software devices are fiction (2 GiB, not enforced; or all of the host's memory).
             return (total, total.saturating_sub(held));

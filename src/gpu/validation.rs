@@ -30,15 +30,15 @@ impl ValidationLog {
 
 /// How the layer takes its settings.
 #[derive(Clone, Copy, PartialEq)]
-pub(super) enum Settings {
+pub(super) enum Channel {
     LayerSettings,
     ValidationFeatures,
     Neither,
 }
 
-impl Settings {
+impl Channel {
     /// What the installed layer offers; refuses where there is no layer.
-    pub(super) fn find(entry: &ash::Entry) -> Result<Settings> {
+    pub(super) fn find(entry: &ash::Entry) -> Result<Channel> {
         // SAFETY: a loaded entry; the call only reads.
         let layers = unsafe { entry.enumerate_instance_layer_properties() };
         let layers = layers.map_err(vulkan("vkEnumerateInstanceLayerProperties"))?;
@@ -61,20 +61,20 @@ impl Settings {
                 .any(|e| e.extension_name_as_c_str() == Ok(name))
         };
         Ok(if offers(ext::layer_settings::NAME) {
-            Settings::LayerSettings
+            Channel::LayerSettings
         } else if offers(ext::validation_features::NAME) {
-            Settings::ValidationFeatures
+            Channel::ValidationFeatures
         } else {
-            Settings::Neither
+            Channel::Neither
         })
     }
 
     /// The instance extension to enable.
     pub(super) fn extension(self) -> Option<&'static CStr> {
         match self {
-            Settings::LayerSettings => Some(ext::layer_settings::NAME),
-            Settings::ValidationFeatures => Some(ext::validation_features::NAME),
-            Settings::Neither => None,
+            Channel::LayerSettings => Some(ext::layer_settings::NAME),
+            Channel::ValidationFeatures => Some(ext::validation_features::NAME),
+            Channel::Neither => None,
         }
     }
 }

@@ -243,10 +243,7 @@ fn stated_or_estimated(scene: &Scene, prefer_box: bool) -> Result<Region> {
             let all = points.iter().chain(&cameras).copied().collect();
             (
                 all,
-                format!(
-                    "the sparse points and cameras, which look outwards ({})",
-                    looks.why
-                ),
+                "the sparse points and the cameras, which look outwards".into(),
             )
         }
     };
