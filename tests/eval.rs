@@ -1,11 +1,13 @@
 //! Scores against brute force, closed forms and values worked out by hand.
 
+use clap::Parser;
 use glam::{DMat4, DVec2, DVec3};
 use neurodin::Error;
+use neurodin::cli::eval::{EvalArgs, score_mesh};
 use neurodin::eval::{GeometryOptions, GeometryScores, Reference, psnr, score_geometry, ssim};
-use neurodin::mesh::Mesh;
 use neurodin::mesh::bvh::{Bvh, Triangle};
 use neurodin::mesh::visibility::Viewpoint;
+use neurodin::mesh::{Mesh, write_mesh};
 
 /// A repeatable stream of numbers in [0, 1).
 struct Random(u64);
@@ -526,4 +528,98 @@ fn ssim_is_that_of_its_definition() {
     let got = ssim(&a, &b, width, height, channels).unwrap();
     assert!(near(got, expected, 1e-9), "{got} for {expected}");
     assert!((0.3..0.99).contains(&got), "{got} would be met by anything");
+}
+
+#[derive(Parser)]
+struct Typed {
+    #[command(flatten)]
+    eval: EvalArgs,
+}
+
+#[test]
+fn meshes_are_scored_from_files() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name).to_str().unwrap().to_string();
+    let (inner, outer) = (globe(1.0, 40), globe(1.08, 40));
+    let points = Mesh {
+        faces: vec![],
+        ..outer.clone()
+    };
+    for (name, mesh) in [
+        ("inner.ply", &inner),
+        ("outer.obj", &outer),
+        ("points.ply", &points),
+    ] {
+        write_mesh(folder.path().join(name).as_path(), mesh, false).unwrap();
+    }
+    let run = |typed: &[&str]| {
+        let args = Typed::try_parse_from([&["eval"], typed].concat())
+            .unwrap()
+            .eval;
+        score_mesh(&args, args.mesh.as_ref().unwrap())
+    };
+    let (mesh, truth, cloud) = (path("inner.ply"), path("outer.obj"), path("points.ply"));
+    let typed = [
+        "--mesh",
+        &mesh,
+        "--reference",
+        &truth,
+        "--reference",
+        &cloud,
+        "--samples",
+        "5000",
+    ];
+    let (report, text) = run(&typed).unwrap();
+    let number = |name: &str| report.pointer(name).unwrap().as_f64().unwrap();
+    assert!(
+        near(number("/accuracy/mean"), 0.08, 2e-3) && near(number("/chamfer"), 0.08, 2e-3),
+        "{report:#}"
+    );
+    assert_eq!(
+        number("/completeness/points"),
+        points.positions.len() as f64
+    );
+    let size = 1.08 * 3f64.sqrt();
+    assert!(
+        near(number("/thresholds/1/threshold"), 0.01 * size, 1e-6)
+            && near(number("/trim"), 0.05 * size, 1e-6)
+    );
+    assert!(
+        text.contains("completeness") && text.lines().count() == 7,
+        "{text}"
+    );
+    let upper = ["--crop=2,2,2,-2,-2,0", "--thresholds", "0.05,0.1"];
+    let (report, _) = run(&[&typed[..], &upper].concat()).unwrap();
+    assert_eq!(report["thresholds"].as_array().unwrap().len(), 2);
+    assert_eq!(report["thresholds"][1]["f_score"], 1.0);
+    assert!(report["completeness"]["points"].as_u64().unwrap() < 2000);
+
+    assert!(
+        run(&[
+            "--mesh",
+            &mesh,
+            "--reference",
+            &truth,
+            "--reference",
+            &truth
+        ])
+        .is_err(),
+        "two true meshes"
+    );
+    assert!(
+        run(&["--mesh", &mesh, "--reference", &cloud, "--crop=5,5,5,6,6,6"]).is_err(),
+        "nothing in the box"
+    );
+    let wrong: [&[&str]; 4] = [
+        &[],
+        &["--mesh", "a"],
+        &["run", "--reference", "b"],
+        &["run", "--mesh", "a", "--reference", "b"],
+    ];
+    for typed in wrong {
+        assert!(
+            Typed::try_parse_from([&["eval"], typed].concat()).is_err(),
+            "{typed:?}"
+        );
+    }
 }

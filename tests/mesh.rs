@@ -4,9 +4,9 @@ use std::cell::Cell;
 use std::collections::HashMap;
 
 use glam::{DMat4, DQuat, DVec3};
-use neurodin::mesh::extract::{PointAttributes, extract_surface, to_world};
+use neurodin::mesh::extract::{PointAttributes, add_attributes, extract_surface, to_world};
 use neurodin::mesh::{ExtractOptions, Lattice, Mesh, SurfaceAttributes, clean, extract_mesh};
-use neurodin::scene::RegionShape;
+use neurodin::scene::{Region, RegionShape};
 use neurodin::{Error, Result};
 use proptest::prelude::*;
 
@@ -569,4 +569,56 @@ fn progress_reaches_the_end_and_can_stop() {
         matches!(stopped, Err(Error::Interrupted { .. })) && blocks == 5,
         "{blocks} blocks"
     );
+}
+
+#[test]
+fn a_region_says_where_its_mesh_belongs() {
+    let region = Region {
+        center: DVec3::new(1.0, 2.0, 3.0),
+        radius: 4.0,
+        shape: RegionShape::Box {
+            half: DVec3::new(1.0, 0.5, 0.9),
+        },
+        how: String::new(),
+    };
+    let mesh = extract(
+        sphere,
+        &ExtractOptions {
+            resolution: 40,
+            ..ExtractOptions::of(&region)
+        },
+    );
+    let [low, high] = mesh.bounds().unwrap();
+    // The ball of radius 0.6 around (0.03, -0.02, 0.01) sticks out of the box along y.
+    assert!(
+        (high.x - (1.0 + 4.0 * 0.63)).abs() < 0.02 && (low.x - (1.0 - 4.0 * 0.57)).abs() < 0.02
+    );
+    assert!(low.y >= 2.0 - 4.0 * 0.5 && high.y <= 2.0 + 4.0 * 0.5);
+}
+
+#[test]
+fn where_the_gradient_vanishes_the_faces_give_the_normal() {
+    struct Flat;
+    impl SurfaceAttributes for Flat {
+        fn attributes(&mut self, points: &[[f32; 3]]) -> Result<PointAttributes> {
+            let gradient = |p: &[f32; 3]| if p[2] > 0.0 { [f32::NAN; 3] } else { [0.0; 3] };
+            Ok((
+                vec![[f32::NAN; 3]; points.len()],
+                points.iter().map(gradient).collect(),
+            ))
+        }
+    }
+    let options = ExtractOptions {
+        resolution: 40,
+        ..Default::default()
+    };
+    let (mut mesh, _) = extract_surface(&mut Analytic(sphere), &options, &mut |_| true).unwrap();
+    add_attributes(&mut mesh, &mut Flat, &mut |_| true).unwrap();
+    for (p, normal) in mesh.positions.iter().zip(&mesh.normals) {
+        let outward = (*p - DVec3::new(0.03, -0.02, 0.01)).normalize();
+        assert!(
+            outward.dot(DVec3::from(normal.map(f64::from))) > 0.98,
+            "{normal:?} at {p}"
+        );
+    }
 }

@@ -83,7 +83,7 @@ fn gradients_outdoors_with_a_background_field() {
             background: Background::Field(field),
             ..trial::config()
         };
-        check_gradients(trial::step(config, 16, 3), 4);
+        check_gradients(trial::step(config, 24, 3), 4);
     }
 }
 

@@ -41,7 +41,7 @@ pub struct EvalArgs {
     #[arg(long, value_name = "FILE", requires = "reference")]
     pub mesh: Option<PathBuf>,
     /// True surface as a mesh or a point cloud; given twice, accuracy is to the mesh and completeness from the points
-    #[arg(long, value_name = "FILE", requires = "mesh")]
+    #[arg(long, value_name = "FILE", requires = "mesh", conflicts_with = "run")]
     pub reference: Vec<PathBuf>,
     /// Distances for precision, recall and F-score [default: 0.5, 1 and 2 % of half the reference's diagonal]
     #[arg(long, value_name = "A,B,..", value_delimiter = ',')]
@@ -58,6 +58,9 @@ pub struct EvalArgs {
     /// Views that must see a place
     #[arg(long, value_name = "N", default_value_t = 1, requires = "visible_from", value_parser = clap::value_parser!(u32).range(1..))]
     pub min_views: u32,
+    /// A place is hidden by what is nearer to the camera by more than this [default: 0.1 % of half the reference's diagonal]
+    #[arg(long, value_name = "D", requires = "visible_from")]
+    pub hidden_by: Option<f64>,
     /// Points drawn on a mesh
     #[arg(long, value_name = "N", default_value_t = 500_000)]
     pub samples: usize,
@@ -98,7 +101,7 @@ pub fn score_mesh(args: &EvalArgs, mesh: &Path) -> Result<(Value, String)> {
         trim: args.trim.unwrap_or(0.05 * size),
         crop,
         min_views: args.min_views,
-        hidden_by: 1e-3 * size,
+        hidden_by: args.hidden_by.unwrap_or(1e-3 * size),
     };
     let views = args
         .visible_from

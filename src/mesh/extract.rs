@@ -8,7 +8,7 @@
 
 use std::collections::HashMap;
 
-use glam::{DMat3, DMat4, DVec3};
+use glam::{DMat3, DMat4, DVec3, Vec3};
 
 use super::Mesh;
 use super::marching_cubes::{MAX_VERTICES, Marcher, OUTSIDE, Sink};
@@ -213,7 +213,7 @@ pub fn add_attributes(
     progress: &mut dyn FnMut(Progress) -> bool,
 ) -> Result<()> {
     let n_vertices = mesh.positions.len();
-    let mut normals = mesh.face_weighted_normals();
+    let mut normals = Vec::with_capacity(n_vertices);
     let mut colors = Vec::with_capacity(n_vertices);
     let mut points = Vec::with_capacity(n_vertices.min(ATTRIBUTE_CHUNK));
     for first in (0..n_vertices).step_by(ATTRIBUTE_CHUNK) {
@@ -234,11 +234,11 @@ pub fn add_attributes(
             rgb.iter()
                 .map(|rgb| rgb.map(|channel| (channel.clamp(0.0, 1.0) * 255.0).round() as u8)),
         );
-        for (normal, gradient) in normals[first..last].iter_mut().zip(gradients) {
-            if let Some(direction) = DVec3::from(gradient.map(f64::from)).try_normalize() {
-                *normal = direction.as_vec3().to_array();
-            }
-        }
+        normals.extend(
+            gradients
+                .iter()
+                .map(|g| Vec3::from(*g).normalize_or_zero().to_array()),
+        );
         report(
             progress,
             Stage::Attributes,
@@ -246,6 +246,14 @@ pub fn add_attributes(
             n_vertices as u64,
             mesh,
         )?;
+    }
+    if normals.contains(&[0.0; 3]) {
+        let of_faces = mesh.face_weighted_normals();
+        for (normal, of_faces) in normals.iter_mut().zip(of_faces) {
+            if *normal == [0.0; 3] {
+                *normal = of_faces;
+            }
+        }
     }
     (mesh.normals, mesh.colors) = (normals, colors);
     Ok(())

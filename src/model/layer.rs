@@ -39,7 +39,7 @@ pub struct LayerShape {
 }
 
 /// Samples that one workgroup of the weight gradient sums up.
-const GRADIENT_CHUNK: u32 = 2048;
+const GRADIENT_CHUNK: u32 = 8192;
 
 impl Layer {
     /// Builds the layer's kernels; `label` names their rows in the profile.

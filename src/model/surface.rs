@@ -12,6 +12,8 @@ use crate::kernels::{appearance_backward, shade_backward, shade_forward, sigmoid
 /// Parameters and kernels of the surface's networks.
 pub struct Surface {
     pub field: Field,
+    /// The same field under a name of its own in the profile: the extra points of bias correction.
+    pub probes: Field,
     heads: Layer,
     colors: Vec<Layer>,
     appearance: u64,
@@ -172,6 +174,7 @@ impl Surface {
         };
         Ok(Surface {
             field: Field::new(gpu, "surface", shape, table, hidden_weight, heads_weight)?,
+            probes: Field::new(gpu, "bias", shape, table, hidden_weight, heads_weight)?,
             heads: Layer::new(gpu, "heads", head_shape, heads_weight)?,
             colors,
             appearance,

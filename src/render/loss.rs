@@ -147,7 +147,7 @@ impl Loss {
                 .bytes(samples / 8.0),
             args,
         );
-        model.surface.field.forward(
+        model.surface.probes.forward(
             rec,
             &model.params,
             self.queries.ptr(),
@@ -169,7 +169,7 @@ impl Loss {
             Work::items(1).bytes(20.0 * f64::from(self.n_rays)),
             args,
         );
-        model.surface.field.backward(
+        model.surface.probes.backward(
             rec,
             &model.params,
             self.queries.ptr(),

@@ -4,6 +4,7 @@ use super::background::Background;
 use super::hash_grid::Grid;
 use super::losses::BiasReduction;
 use super::sampling::{Region, Stretch};
+use super::tape::ReluEdge;
 use std::collections::BTreeMap;
 
 /// The shape of everything, and the numbers that do not change with time.
@@ -92,6 +93,9 @@ pub struct Step {
     pub now: Now,
     /// Normalised edges `[N, bins + 1]` of both proposal levels and the final one, to be taken as they are.
     pub edges: Option<[Vec<f64>; 3]>,
+    /// The surface's points `[7 · N · S]`, likewise: rounded to float32, a point moves by a ten-thousandth of a fine cell.
+    pub points: Option<Vec<[f64; 3]>>,
+    pub relu_edge: ReluEdge,
 }
 
 /// Everything that the forward pass makes, sample-major with the component innermost.
@@ -164,7 +168,7 @@ pub struct Outcome {
 }
 
 impl StepConfig {
-    /// Name, rows and columns of every parameter span .
+    /// Name, rows and columns of every parameter span.
     pub fn spans(&self) -> Vec<(String, usize, usize)> {
         let mut spans = Vec::new();
         let mut plain = |name: String, rows: usize, cols: usize| spans.push((name, rows, cols));

@@ -6,6 +6,7 @@ use super::hash_grid::Grid;
 use super::losses::BiasReduction;
 use super::npz::Npz;
 use super::sampling::Region;
+use super::tape::ReluEdge;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
@@ -152,5 +153,7 @@ pub fn whole_step(npz: &Npz) -> Step {
         draws,
         now,
         edges: None,
+        points: None,
+        relu_edge: ReluEdge::default(),
     }
 }

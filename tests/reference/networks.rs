@@ -55,8 +55,18 @@ pub struct NormedLayer {
 impl NormedLayer {
     pub fn apply(self, tape: &mut Tape, x: Var) -> Var {
         let w = weight_norm(tape, self.v, self.g);
+        self.apply_weights(tape, w, x)
+    }
+
+    fn apply_weights(self, tape: &mut Tape, w: Var, x: Var) -> Var {
         let product = tape.matmul_transposed(x, w);
         tape.add_row(product, self.bias)
+    }
+
+    pub fn apply_with_relu(self, tape: &mut Tape, x: Var) -> Var {
+        let w = weight_norm(tape, self.v, self.g);
+        let z = self.apply_weights(tape, w, x);
+        relu(tape, z, x, w, Some(self.bias))
     }
 }
 
@@ -81,9 +91,34 @@ pub fn softplus_100(tape: &mut Tape, x: Var) -> Var {
     )
 }
 
-/// max(x, 0), with slope 0 at 0.
-pub fn relu(tape: &mut Tape, x: Var) -> Var {
-    tape.map(x, |x| x.max(0.0), |x, _| if x > 0.0 { 1.0 } else { 0.0 })
+/// max(z, 0) for z = x Wᵀ + b, with slope 0 at 0 unless the tape says otherwise.
+pub fn relu(tape: &mut Tape, z: Var, x: Var, w: Var, bias: Option<Var>) -> Var {
+    let edge = tape.relu_edge;
+    let value: Vec<f64> = tape.value(z).iter().map(|z| z.max(0.0)).collect();
+    let mut slope: Vec<f64> = tape
+        .value(z)
+        .iter()
+        .map(|&z| f64::from(u8::from(z > 0.0)))
+        .collect();
+    if edge.margin > 0.0 {
+        for (row, x) in tape.value(x).chunks_exact(x.cols).enumerate() {
+            for (unit, w_row) in tape.value(w).chunks_exact(w.cols).enumerate() {
+                let at = row * w.rows + unit;
+                let products: f64 = x.iter().zip(w_row).map(|(x, w)| (x * w).abs()).sum();
+                let bias = bias.map_or(0.0, |bias| tape.value(bias)[unit].abs());
+                if tape.value(z)[at].abs() <= edge.margin * (products + bias) {
+                    slope[at] = edge.slope;
+                }
+            }
+        }
+    }
+    tape.record(z.rows, z.cols, value, &[z], move |_, d_y, gradients| {
+        if let Some(d_z) = gradients.of(z) {
+            for ((d_z, d_y), slope) in d_z.iter_mut().zip(d_y).zip(&slope) {
+                *d_z += d_y * slope;
+            }
+        }
+    })
 }
 
 pub fn sigmoid(tape: &mut Tape, x: Var) -> Var {
@@ -110,8 +145,7 @@ pub fn color_network(tape: &mut Tape, layers: &[NormedLayer], x: Var) -> Var {
         .expect("a network of at least one layer");
     let mut x = x;
     for layer in hidden {
-        let z = layer.apply(tape, x);
-        x = relu(tape, z);
+        x = layer.apply_with_relu(tape, x);
     }
     let z = last.apply(tape, x);
     sigmoid(tape, z)
@@ -132,7 +166,7 @@ pub fn plain_network(tape: &mut Tape, layers: &[Var], x: Var) -> Var {
     let mut x = x;
     for &layer in hidden {
         let z = tape.matmul_transposed(x, layer);
-        x = relu(tape, z);
+        x = relu(tape, z, x, layer, None);
     }
     tape.matmul_transposed(x, *last)
 }

@@ -52,6 +52,7 @@ impl Step {
         } = self;
         let (n, samples) = (rays.origins.len(), config.samples);
         let tape = &mut Tape::default();
+        tape.relu_edge = self.relu_edge;
         let spans = self.put_parameters(tape);
 
         // Rays and samples.
@@ -121,7 +122,10 @@ impl Step {
             .map(|&draw| surface::tap_step(draw, config.tap_range, config.tap_floor))
             .collect();
         assert_eq!(steps.len(), n * samples, "one tap draw per shading sample");
-        images.points = [starts.clone(), surface::tap_points(&starts, &steps)].concat();
+        images.points = self
+            .points
+            .clone()
+            .unwrap_or_else(|| [starts.clone(), surface::tap_points(&starts, &steps)].concat());
         let field = Surface {
             table: spans.get("surface.table"),
             hidden: spans.normed("surface.hidden"),

@@ -30,6 +30,15 @@ struct Node {
 #[derive(Default)]
 pub struct Tape {
     nodes: Vec<Node>,
+    pub relu_edge: ReluEdge,
+}
+
+/// What a ReLU's slope is at its edge: where |Σ w x + b| ≤ margin · (Σ |w x| + |b|). In float32 such a sum may fall on either side of
+/// zero, and with it the gradient of all that few samples touch; a test can take both slopes and ask for anything between.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct ReluEdge {
+    pub margin: f64,
+    pub slope: f64,
 }
 
 /// What [`Tape::backward`] leaves behind: the gradient of every node that the loss depends on.

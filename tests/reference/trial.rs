@@ -5,6 +5,8 @@ use super::batch::{Draws, Now, Rays, Step, StepConfig};
 use super::hash_grid::Grid;
 use super::losses::BiasReduction;
 use super::sampling::Region;
+use super::tape::ReluEdge;
+use std::collections::BTreeMap;
 use std::f64::consts::{PI, TAU};
 
 /// SplitMix64 (Steele et al. 2014).
@@ -85,14 +87,16 @@ pub fn background_field() -> FieldConfig {
     }
 }
 
-/// `n` rays from a shell around the region (or from inside a box) towards it, the last one past it, with parameters whose surface is
-/// about a sphere of radius ½, roughened.
-pub fn step(config: StepConfig, n: usize, seed: u64) -> Step {
-    let random = &mut Random(seed);
-    let inside = matches!(config.region, Region::Box { .. });
+/// Values for every span of a configuration. The surface is about a sphere of radius ½, roughened, with free space outside it, or
+/// inside where `inside_out`.
+pub fn parameters(
+    config: &StepConfig,
+    inside_out: bool,
+    random: &mut Random,
+) -> BTreeMap<String, Vec<f64>> {
     // Free space is where f > 0: outside the sphere, or inside it.
-    let side = if inside { -1.0 } else { 1.0 };
-    let mut params = std::collections::BTreeMap::new();
+    let side = if inside_out { -1.0 } else { 1.0 };
+    let mut params = BTreeMap::new();
     for (name, rows, cols) in config.spans() {
         let values = match name.as_str() {
             "surface.hidden.v" => {
@@ -112,6 +116,7 @@ pub fn step(config: StepConfig, n: usize, seed: u64) -> Step {
                     .map(|_| mean * (1.0 + random.symmetric(0.1)))
                     .collect()
             }
+            "surface.hidden.bias" => (0..cols).map(|_| random.symmetric(0.02)).collect(),
             "surface.heads.bias" => (0..cols)
                 .map(|_| -0.5 * side + random.symmetric(0.02))
                 .collect(),
@@ -145,7 +150,14 @@ pub fn step(config: StepConfig, n: usize, seed: u64) -> Step {
             .collect();
         params.insert(name, g);
     }
+    params
+}
 
+/// `n` rays from a shell around the region towards it, the last one past it; or from inside a box, with free space there.
+pub fn step(config: StepConfig, n: usize, seed: u64) -> Step {
+    let random = &mut Random(seed);
+    let inside = matches!(config.region, Region::Box { .. });
+    let params = parameters(&config, inside, random);
     let mut rays = Rays::default();
     for ray in 0..n {
         let origin = random
@@ -189,5 +201,7 @@ pub fn step(config: StepConfig, n: usize, seed: u64) -> Step {
         draws,
         now,
         edges: None,
+        points: None,
+        relu_edge: ReluEdge::default(),
     }
 }

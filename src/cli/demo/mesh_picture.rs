@@ -8,6 +8,7 @@
 use glam::{DMat4, DVec2, DVec3, Vec3, dvec2, dvec3, vec3};
 use rayon::prelude::*;
 
+use crate::mesh::Mesh;
 use crate::scene::synthetic;
 
 /// Samples per pixel and axis.
@@ -24,17 +25,6 @@ pub struct Rgb {
     pub width: usize,
     pub height: usize,
     pub bytes: Vec<u8>,
-}
-
-/// Triangles to be shown, in the world frame.
-#[derive(Clone, Copy, Debug)]
-pub struct Triangles<'a> {
-    pub positions: &'a [[f32; 3]],
-    pub faces: &'a [[u32; 3]],
-    /// Per vertex; without them they are the area-weighted mean of the faces'.
-    pub normals: Option<&'a [[f32; 3]]>,
-    /// Per vertex, sRGB; without them everything is of clay's colour.
-    pub colors: Option<&'a [[u8; 3]]>,
 }
 
 /// From where, and onto how many pixels.
@@ -121,22 +111,21 @@ impl Visible {
         }
     }
 
-    /// What `eye` sees of a mesh.
-    pub fn of_mesh(mesh: &Triangles, eye: &Eye) -> Visible {
+    /// What `eye` sees of a mesh in the world frame. Without normals they are the mean of the faces'; without colours all is clay.
+    pub fn of_mesh(mesh: &Mesh, eye: &Eye) -> Visible {
         let eye = eye.finer();
         let eye_from_world = eye.world_from_eye.inverse();
         let corners: Vec<Option<(DVec2, f64)>> = mesh
             .positions
             .par_iter()
-            .map(|p| eye.project(eye_from_world.transform_point3(Vec3::from(*p).as_dvec3())))
+            .map(|p| eye.project(eye_from_world.transform_point3(*p)))
             .collect();
         let own_normals;
-        let normals = match mesh.normals {
-            Some(normals) => normals,
-            None => {
-                own_normals = vertex_normals(mesh);
-                &own_normals
-            }
+        let normals = if mesh.normals.is_empty() {
+            own_normals = mesh.face_weighted_normals();
+            &own_normals
+        } else {
+            &mesh.normals
         };
         let mut visible = Visible::nothing(&eye);
         let rows_per_band = eye
@@ -160,7 +149,7 @@ impl Visible {
             .for_each(|(index, (((depth, normal), color), inner))| {
                 let first_row = index * rows_per_band;
                 let rows = first_row..first_row + depth.len() / eye.width;
-                for face in mesh.faces {
+                for face in &mesh.faces {
                     let [Some(a), Some(b), Some(c)] = face.map(|v| corners[v as usize]) else {
                         continue;
                     };
@@ -175,9 +164,10 @@ impl Visible {
                                 .sum::<Vec3>()
                         };
                         normal[at] = mix(&|v| Vec3::from(normals[v])).normalize_or(Vec3::Z);
-                        color[at] = match mesh.colors {
-                            Some(colors) => mix(&|v| Vec3::from(colors[v].map(decode_srgb))),
-                            None => CLAY,
+                        color[at] = if mesh.colors.is_empty() {
+                            CLAY
+                        } else {
+                            mix(&|v| Vec3::from(mesh.colors[v].map(decode_srgb)))
                         };
                         // Counter-clockwise in space, y up, is clockwise on a screen whose y points down.
                         inner[at] = (b.0 - a.0).perp_dot(c.0 - a.0) > 0.0;
@@ -436,21 +426,6 @@ fn scan(
     }
 }
 
-/// Mean of the adjacent faces' normals, weighted by area.
-fn vertex_normals(mesh: &Triangles) -> Vec<[f32; 3]> {
-    let mut sums = vec![Vec3::ZERO; mesh.positions.len()];
-    for face in mesh.faces {
-        let [a, b, c] = face.map(|v| Vec3::from(mesh.positions[v as usize]));
-        let normal = (b - a).cross(c - a);
-        for v in face {
-            sums[*v as usize] += normal;
-        }
-    }
-    sums.into_iter()
-        .map(|sum| sum.normalize_or(Vec3::Z).to_array())
-        .collect()
-}
-
 fn decode_srgb(byte: u8) -> f32 {
     let value = f32::from(byte) / 255.0;
     if value <= 0.040_45 {
@@ -465,33 +440,26 @@ mod tests {
     use super::*;
 
     /// A cube of edge 1, wound outwards, each corner in its own colour.
-    struct Cube {
-        positions: Vec<[f32; 3]>,
-        faces: Vec<[u32; 3]>,
-        colors: Vec<[u8; 3]>,
-    }
-
-    impl Cube {
-        fn new() -> Cube {
-            let upper = |k: u32, axis: u32| k >> axis & 1 == 1;
-            let quads = [
-                [0, 2, 3, 1],
-                [4, 5, 7, 6],
-                [0, 1, 5, 4],
-                [2, 6, 7, 3],
-                [0, 4, 6, 2],
-                [1, 3, 7, 5],
-            ];
-            let split = |q: &[u32; 4]| [[q[0], q[1], q[2]], [q[0], q[2], q[3]]];
-            Cube {
-                positions: (0..8)
-                    .map(|k| [0, 1, 2].map(|axis| if upper(k, axis) { 0.5 } else { -0.5 }))
-                    .collect(),
-                faces: quads.iter().flat_map(split).collect(),
-                colors: (0..8)
-                    .map(|k| [0, 1, 2].map(|axis| if upper(k, axis) { 255 } else { 0 }))
-                    .collect(),
-            }
+    fn cube() -> Mesh {
+        let upper = |k: u32, axis: u32| k >> axis & 1 == 1;
+        let quads = [
+            [0, 2, 3, 1],
+            [4, 5, 7, 6],
+            [0, 1, 5, 4],
+            [2, 6, 7, 3],
+            [0, 4, 6, 2],
+            [1, 3, 7, 5],
+        ];
+        let split = |q: &[u32; 4]| [[q[0], q[1], q[2]], [q[0], q[2], q[3]]];
+        let place =
+            |k: u32| DVec3::from([0, 1, 2].map(|axis| if upper(k, axis) { 0.5 } else { -0.5 }));
+        Mesh {
+            positions: (0..8).map(place).collect(),
+            faces: quads.iter().flat_map(split).collect(),
+            colors: (0..8)
+                .map(|k| [0, 1, 2].map(|axis| if upper(k, axis) { 255 } else { 0 }))
+                .collect(),
+            normals: Vec::new(),
         }
     }
 
@@ -515,13 +483,7 @@ mod tests {
 
     #[test]
     fn a_cube_is_seen_where_it_is() {
-        let cube = Cube::new();
-        let mesh = Triangles {
-            positions: &cube.positions,
-            faces: &cube.faces,
-            normals: None,
-            colors: Some(&cube.colors),
-        };
+        let mesh = cube();
         for (lens, half) in [
             (Lens::Parallel(40.0), 20.0),
             (Lens::Perspective(140.0), 20.0),
@@ -567,11 +529,11 @@ mod tests {
             [-1.0, 8.0, -1.0],
         ];
         let colors = [[0; 3], [0; 3], [255; 3], [255; 3]];
-        let mesh = Triangles {
-            positions: &positions,
-            faces: &[[0, 1, 2], [0, 2, 3]],
-            normals: None,
-            colors: Some(&colors),
+        let mesh = Mesh {
+            positions: positions.map(DVec3::from).to_vec(),
+            faces: vec![[0, 1, 2], [0, 2, 3]],
+            colors: colors.to_vec(),
+            normals: Vec::new(),
         };
         let eye = Eye {
             // Looks along +y.
@@ -597,19 +559,10 @@ mod tests {
 
     #[test]
     fn an_open_surface_shows_its_inner_side() {
-        let Cube {
-            positions,
-            mut faces,
-            ..
-        } = Cube::new();
+        let mut mesh = cube();
+        mesh.colors.clear();
         // Without the upper face one looks at the lower one from within.
-        faces.drain(2..4);
-        let mesh = Triangles {
-            positions: &positions,
-            faces: &faces,
-            normals: None,
-            colors: None,
-        };
+        mesh.faces.drain(2..4);
         let visible = Visible::of_mesh(&mesh, &from_above(Lens::Parallel(40.0)));
         let middle = visible.eye.height / 2 * visible.eye.width + visible.eye.width / 2;
         assert!(visible.inner[middle]);
@@ -626,7 +579,7 @@ mod tests {
     #[test]
     fn shadows_fall_away_from_the_sun() {
         // A small plate above a large one.
-        let plate = |half: f32, z: f32| {
+        let plate = |half: f64, z: f64| {
             [
                 [-half, -half, z],
                 [half, -half, z],
@@ -634,13 +587,12 @@ mod tests {
                 [-half, half, z],
             ]
         };
-        let positions: Vec<[f32; 3]> = plate(1.0, 0.0).into_iter().chain(plate(0.2, 0.4)).collect();
+        let positions: Vec<[f64; 3]> = plate(1.0, 0.0).into_iter().chain(plate(0.2, 0.4)).collect();
         let faces = [[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]];
-        let mesh = Triangles {
-            positions: &positions,
-            faces: &faces,
-            normals: None,
-            colors: None,
+        let mesh = Mesh {
+            positions: positions.into_iter().map(DVec3::from).collect(),
+            faces: faces.to_vec(),
+            ..Mesh::default()
         };
         let visible = Visible::of_mesh(&mesh, &from_above(Lens::Parallel(30.0)));
         let from_sun = Visible::of_mesh(&mesh, &sun_eye(DVec3::ZERO, 1.5));

@@ -1,0 +1,92 @@
+//! The golden training step of the authors' own model, through the device.
+//!
+//! Two differences of definition are left aside by giving the twin what the device has: the authors' grid scales are in double
+//! precision there, and their background is a fixed colour, here the learned one at that colour.
+
+use crate::reference::background::Background;
+use crate::reference::batch::Step;
+use crate::reference::golden;
+use crate::reference::tape::ReluEdge;
+use crate::rig::{GradientRange, Rig, agreement};
+use neurodin::Result;
+use neurodin::config::{BiasReduction, Config};
+use neurodin::scene::RegionShape;
+use neurodin::train::schedule::Schedule;
+
+#[test]
+fn published_step() -> Result<()> {
+    let Some(npz) = golden::open("e2e_stage1") else {
+        return Ok(());
+    };
+    let published = golden::whole_step(&npz);
+    let mut config = Config::preset("outdoor-tiny")?;
+    config.rays = published.rays.origins.len() as u32;
+    config.loss.bias.reduction = BiasReduction::Published;
+    let rig = Rig::new(config, RegionShape::Sphere)?;
+    assert_eq!(rig.twin.samples, published.config.samples);
+    assert_eq!(rig.twin.proposal_samples, published.config.proposal_samples);
+
+    let mut params = published.params.clone();
+    let Background::Fixed(color) = published.config.background else {
+        panic!("a fixed background");
+    };
+    let logits = color.iter().map(|c| (c / (1.0 - c)).ln()).collect();
+    params.insert("background.constant".into(), logits);
+    rig.upload_parameters(&mut params)?;
+    let rays = rig.upload_rays(&published.rays)?;
+    let draws = rig.upload_draws(&published.draws)?;
+    let now = neurodin::train::schedule::Now {
+        anneal: published.now.anneal,
+        inv_s_lower: published.now.inv_s_lower,
+        bias_weight: published.now.bias_weight,
+        ..Schedule::new(&rig.config).at(0)
+    };
+    rig.gpu.submit("golden step", |rec| {
+        rig.trainer.gradients(rec, &now);
+        Ok(())
+    })?;
+    let gradients = rig.download_spans(rig.trainer.model().params.grads())?;
+
+    let twin = Step {
+        config: rig.twin.clone(),
+        params,
+        rays,
+        draws,
+        now: published.now,
+        edges: Some(rig.edges()?),
+        points: Some(rig.points()?),
+        relu_edge: ReluEdge::default(),
+    };
+    let twin = GradientRange::of(&twin);
+    for (span, gradient) in &gradients {
+        twin.check(span, gradient);
+    }
+    for (span, array) in golden::small_spans() {
+        let (distance, cosine) = agreement(&gradients[&span], npz.values(&format!("grad_{array}")));
+        println!(
+            "{span}: against the authors: relative L2 {distance:.1e}, 1 - cosine {:.1e}",
+            1.0 - cosine
+        );
+        assert!(
+            distance <= 2e-3 && cosine >= 0.99999,
+            "{span}: relative L2 {distance:.2e}, cosine {cosine}"
+        );
+    }
+    for (span, array) in golden::table_spans() {
+        let indices = npz.values(&format!("gradidx_{array}"));
+        let some: Vec<f64> = indices
+            .iter()
+            .map(|&i| gradients[&span][i as usize])
+            .collect();
+        let (distance, cosine) = agreement(&some, npz.values(&format!("gradval_{array}")));
+        println!(
+            "{span}: against the authors: relative L2 {distance:.1e}, 1 - cosine {:.1e}",
+            1.0 - cosine
+        );
+        assert!(
+            distance <= 2e-3 && cosine >= 0.99999,
+            "{span}: relative L2 {distance:.2e}, cosine {cosine}"
+        );
+    }
+    rig.check_device()
+}

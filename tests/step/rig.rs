@@ -1,0 +1,393 @@
+//! A trainer on the device beside the twin of its configuration, and the way of numbers between the two.
+
+use crate::reference::background::{Background, FieldConfig};
+use crate::reference::batch::{Draws, Rays, Step, StepConfig};
+use crate::reference::hash_grid::{Grid, Level};
+use crate::reference::losses;
+use crate::reference::sampling::{self, Stretch};
+use crate::reference::tape::ReluEdge;
+use neurodin::Result;
+use neurodin::config::{BackgroundKind, BiasReduction, Config};
+use neurodin::gpu::{Buffer, Gpu, GpuOptions};
+use neurodin::model::HashGrid;
+use neurodin::scene::synthetic::{CENTER, RADIUS, SyntheticOptions};
+use neurodin::scene::{Region, RegionShape, Scene, SceneOptions};
+use neurodin::train::Trainer;
+use std::collections::BTreeMap;
+
+pub struct Rig {
+    pub gpu: Gpu,
+    pub config: Config,
+    pub trainer: Trainer,
+    pub twin: StepConfig,
+    _folder: tempfile::TempDir,
+}
+
+impl Rig {
+    /// A trainer on a few small pictures of the built-in scene, under the validation layer, with guard words and poisoned scratch.
+    pub fn new(config: Config, shape: RegionShape) -> Result<Rig> {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let root = folder.path().join("scene");
+        let pictures = SyntheticOptions {
+            train_views: 3,
+            test_views: 1,
+            width: 32,
+            height: 24,
+            reference_spacing: 0.5,
+        };
+        pictures.write(&root, &mut |_, _, _| {})?;
+        let scene = Scene::open(&root, &SceneOptions::default())?;
+        let region = Region {
+            center: CENTER,
+            radius: RADIUS,
+            shape: shape.clone(),
+            how: "given".into(),
+        };
+        let config = config.validated()?;
+        let gpu = Gpu::new(&GpuOptions {
+            guard: true,
+            validation: true,
+            ..GpuOptions::default()
+        })?;
+        let trainer = Trainer::new(&gpu, &scene, &region, &config)?;
+        let twin = twin_config(&config, &shape, trainer.model().n_views + 1);
+        Ok(Rig {
+            gpu,
+            config,
+            trainer,
+            twin,
+            _folder: folder,
+        })
+    }
+
+    /// Nothing was written behind the end of a buffer, and the validation layer has nothing to say.
+    pub fn check_device(&self) -> Result<()> {
+        self.gpu.finish()?;
+        let overruns = self.gpu.check_guards()?;
+        assert!(overruns.is_empty(), "written past the end: {overruns:?}");
+        let messages = self.gpu.validation_messages();
+        assert!(messages.is_empty(), "{}", messages.join("\n"));
+        Ok(())
+    }
+
+    pub fn n_rays(&self) -> usize {
+        self.config.rays as usize
+    }
+
+    pub fn download(&self, buffer: &Buffer<f32>) -> Result<Vec<f64>> {
+        let values = self.gpu.download(buffer, 0, buffer.len())?;
+        Ok(values.into_iter().map(f64::from).collect())
+    }
+
+    pub fn upload(
+        &self,
+        buffer: &Buffer<f32>,
+        values: impl IntoIterator<Item = f64>,
+    ) -> Result<()> {
+        let values: Vec<f32> = values.into_iter().map(|x| x as f32).collect();
+        self.gpu.upload(buffer, 0, &values)
+    }
+
+    /// Rounds the twin's parameters to float32 and puts them on the device.
+    pub fn upload_parameters(&self, params: &mut BTreeMap<String, Vec<f64>>) -> Result<()> {
+        let block = &self.trainer.model().params;
+        let spans = || block.spans().iter().filter(|span| !span.is_empty());
+        for span in spans() {
+            let values = params
+                .get_mut(&span.name)
+                .unwrap_or_else(|| panic!("the twin has no span {}", span.name));
+            let mut rounded: Vec<f32> = values.iter().map(|&x| x as f32).collect();
+            *values = rounded.iter().map(|&x| f64::from(x)).collect();
+            if let Some(order) = self.column_order(&span.name) {
+                let rows = rounded.chunks_exact(order.len());
+                rounded = rows.flat_map(|row| order.iter().map(|&c| row[c])).collect();
+            }
+            assert_eq!(rounded.len() as u64, span.len(), "{}", span.name);
+            self.gpu.upload(block.values(), span.first, &rounded)?;
+        }
+        assert_eq!(params.len(), spans().count(), "spans of both sides");
+        Ok(())
+    }
+
+    /// A buffer shaped like the parameter block, by the twin's spans.
+    pub fn download_spans(&self, block: &Buffer<f32>) -> Result<BTreeMap<String, Vec<f64>>> {
+        let mut spans = BTreeMap::new();
+        let block_spans = self.trainer.model().params.spans();
+        for span in block_spans.iter().filter(|span| !span.is_empty()) {
+            let values = self.gpu.download(block, span.first, span.len())?;
+            let mut values: Vec<f64> = values.into_iter().map(f64::from).collect();
+            if let Some(order) = self.column_order(&span.name) {
+                let mut back = vec![0.0; values.len()];
+                for (row, theirs) in back
+                    .chunks_exact_mut(order.len())
+                    .zip(values.chunks_exact(order.len()))
+                {
+                    order.iter().zip(theirs).for_each(|(&c, &x)| row[c] = x);
+                }
+                values = back;
+            }
+            spans.insert(span.name.clone(), values);
+        }
+        Ok(spans)
+    }
+
+    /// The twin's columns in the device's order, where they differ: the first colour layers' inputs, which the device sorts so that
+    /// those that receive gradients come first (glsl/lib/shading.glsl, glsl/lib/background.glsl).
+    fn column_order(&self, span: &str) -> Option<Vec<usize>> {
+        let twin = &self.twin;
+        // Widths of the twin's parts, in its order, and the device's order of the parts.
+        let (widths, order) = match (span, &twin.background) {
+            ("color.0.v", _) => (
+                vec![3, 27, 3, twin.features, twin.appearance],
+                vec![3, 2, 4, 0, 1],
+            ),
+            ("background.color.0", Background::Field(field)) => {
+                (vec![16, field.geometry, field.appearance], vec![1, 2, 0])
+            }
+            _ => return None,
+        };
+        let columns = |part: usize| {
+            let first: usize = widths[..part].iter().sum();
+            first..first + widths[part]
+        };
+        Some(order.into_iter().flat_map(columns).collect())
+    }
+
+    /// The rays that lie in the device's buffers.
+    pub fn rays(&self) -> Result<Rays> {
+        let rays = &self.trainer.renderer().rays;
+        let near_far = self.download(&rays.near_far)?;
+        let outside = self.gpu.download(&rays.outside, 0, rays.outside.len())?;
+        let view = self.gpu.download(&rays.view, 0, rays.view.len())?;
+        let n = self.n_rays();
+        let stretch = |ray: usize| Stretch {
+            near: near_far[ray],
+            far: near_far[n + ray],
+            outside: outside[ray] != 0,
+        };
+        Ok(Rays {
+            origins: interleaved(&self.download(&rays.origins)?),
+            directions: interleaved(&self.download(&rays.directions)?),
+            target: interleaved(&self.download(&rays.target)?),
+            view: view.into_iter().map(|view| view as usize).collect(),
+            stretches: Some((0..n).map(stretch).collect()),
+        })
+    }
+
+    /// Puts rays into the device's buffers, and gives back what float32 made of them.
+    pub fn upload_rays(&self, rays: &Rays) -> Result<Rays> {
+        let on_device = &self.trainer.renderer().rays;
+        let collide = |ray: usize| {
+            sampling::collide(self.twin.region, rays.origins[ray], rays.directions[ray])
+        };
+        let stretches: Vec<Stretch> = (0..self.n_rays()).map(collide).collect();
+        self.upload(&on_device.origins, planar(&rays.origins))?;
+        self.upload(&on_device.directions, planar(&rays.directions))?;
+        self.upload(&on_device.target, planar(&rays.target))?;
+        let near_far: Vec<[f64; 2]> = stretches.iter().map(|s| [s.near, s.far]).collect();
+        self.upload(&on_device.near_far, planar(&near_far))?;
+        let outside: Vec<u32> = stretches.iter().map(|s| u32::from(s.outside)).collect();
+        self.gpu.upload(&on_device.outside, 0, &outside)?;
+        let view: Vec<u32> = rays.view.iter().map(|&view| view as u32).collect();
+        self.gpu.upload(&on_device.view, 0, &view)?;
+        self.rays()
+    }
+
+    /// The random numbers that lie in the device's buffer: pixels [3, n], jitter [3, n], taps [n, S], background [n, edges].
+    pub fn draws(&self) -> Result<Draws> {
+        let all = self.download(&self.trainer.renderer().draws.all)?;
+        let (n, taps) = (self.n_rays(), self.n_rays() * self.twin.samples);
+        let jitter = |level: usize| all[(3 + level) * n..(4 + level) * n].to_vec();
+        Ok(Draws {
+            jitter: [jitter(0), jitter(1), jitter(2)],
+            taps: all[6 * n..6 * n + taps].to_vec(),
+            background: all[6 * n + taps..].to_vec(),
+        })
+    }
+
+    pub fn upload_draws(&self, draws: &Draws) -> Result<Draws> {
+        let pixels = vec![0.5; 3 * self.n_rays()];
+        let [first, second, third] = &draws.jitter;
+        let all = [
+            &pixels,
+            first,
+            second,
+            third,
+            &draws.taps,
+            &draws.background,
+        ];
+        self.upload(
+            &self.trainer.renderer().draws.all,
+            all.into_iter().flatten().copied(),
+        )?;
+        self.draws()
+    }
+
+    /// The surface's points, samples and taps.
+    pub fn points(&self) -> Result<Vec<[f64; 3]>> {
+        let points = &self.trainer.renderer().surface.points;
+        Ok(interleaved(&self.download(points)?))
+    }
+
+    /// Normalised edges of all three levels.
+    pub fn edges(&self) -> Result<[Vec<f64>; 3]> {
+        let of = |level: usize| self.download(self.trainer.renderer().sampler.edges_of(level));
+        Ok([of(0)?, of(1)?, of(2)?])
+    }
+}
+
+/// The twin's configuration for one of the crate's.
+fn twin_config(config: &Config, shape: &RegionShape, views: u32) -> StepConfig {
+    let (surface, sampling, bias) = (&config.surface, &config.sampling, &config.loss.bias);
+    let proposal_grid = |level: usize| {
+        grid(HashGrid {
+            levels: sampling.proposal_levels,
+            base: sampling.proposal_base,
+            max: sampling.proposal_max[level],
+            log2_size: sampling.proposal_log2_size,
+            features: sampling.proposal_features,
+        })
+    };
+    let background = &config.background;
+    StepConfig {
+        region: match shape {
+            RegionShape::Sphere => sampling::Region::Sphere,
+            RegionShape::Box { half } => sampling::Region::Box {
+                half: half.to_array(),
+            },
+        },
+        train: true,
+        proposal_grids: [proposal_grid(0), proposal_grid(1)],
+        proposal_hidden: sampling.proposal_hidden as usize,
+        proposal_samples: sampling.proposal_samples.map(|samples| samples as usize),
+        samples: sampling.samples as usize,
+        grid: grid(HashGrid {
+            levels: config.hash.levels,
+            base: config.hash.base,
+            max: config.hash.max,
+            log2_size: config.hash.log2_size,
+            features: config.hash.features,
+        }),
+        hidden: surface.hidden as usize,
+        features: surface.features as usize,
+        scale_range: surface.scale_max,
+        scale_floor: surface.scale_floor,
+        tap_range: surface.tap_range,
+        tap_floor: 1.0 / (4.0 * f64::from(config.hash.max)),
+        color_hidden: config.color.hidden as usize,
+        color_layers: config.color.layers as usize,
+        views: views as usize,
+        appearance: config.appearance.dims as usize,
+        background: match background.kind {
+            BackgroundKind::None => Background::Black,
+            BackgroundKind::Constant => Background::Learned,
+            BackgroundKind::Field => Background::Field(FieldConfig {
+                grid: grid(HashGrid {
+                    levels: background.levels,
+                    base: background.base,
+                    max: background.max,
+                    log2_size: background.log2_size,
+                    features: background.features,
+                }),
+                samples: background.samples as usize,
+                far: background.far,
+                hidden: background.hidden as usize,
+                geometry: background.geometry as usize,
+                appearance: config.appearance.dims as usize,
+                contraction: background.contraction,
+            }),
+        },
+        eikonal_weight: config.loss.eikonal,
+        interlevel_weight: config.loss.interlevel,
+        bias_epsilon: bias.epsilon,
+        bias_offset: bias.offset,
+        bias_reduction: match bias.reduction {
+            BiasReduction::PerRay => losses::BiasReduction::PerRay,
+            BiasReduction::Published => losses::BiasReduction::Published,
+        },
+        bias_needs_opaque: !surface.inside_out,
+    }
+}
+
+/// A grid with the device's own level table.
+fn grid(shape: HashGrid) -> Grid {
+    let level = |level: &neurodin::kernels::Level| Level {
+        scale: f64::from(level.scale),
+        resolution: level.resolution,
+        entries: level.entries,
+        offset: level.offset as usize,
+        dense: level.hashed == 0,
+    };
+    Grid {
+        levels: shape.level_table().iter().map(level).collect(),
+        features: shape.features as usize,
+    }
+}
+
+/// `[n, C]` from the planes `[C, n]`.
+pub fn interleaved<const C: usize>(planes: &[f64]) -> Vec<[f64; C]> {
+    let n = planes.len() / C;
+    (0..n)
+        .map(|i| std::array::from_fn(|c| planes[c * n + i]))
+        .collect()
+}
+
+/// The planes `[C, n]` of `[n, C]`.
+pub fn planar<const C: usize>(vectors: &[[f64; C]]) -> Vec<f64> {
+    (0..C)
+        .flat_map(|c| vectors.iter().map(move |v| v[c]))
+        .collect()
+}
+
+/// The twin's gradients with the slope of every ReLU near its edge taken as 0, and as 1.
+pub struct GradientRange([BTreeMap<String, Vec<f64>>; 2]);
+
+impl GradientRange {
+    pub fn of(step: &Step) -> GradientRange {
+        let with = |slope: f64| {
+            let relu_edge = ReluEdge {
+                margin: 1e-6,
+                slope,
+            };
+            Step {
+                relu_edge,
+                ..step.clone()
+            }
+            .run()
+            .gradients
+        };
+        GradientRange([with(0.0), with(1.0)])
+    }
+
+    /// Relative L2 distance of at most 1e-4 and a cosine of at least 0.99999 to the nearest gradient in range.
+    #[track_caller]
+    pub fn check(&self, span: &str, device: &[f64]) {
+        let [a, b] = [&self.0[0][span], &self.0[1][span]];
+        assert_eq!(device.len(), a.len(), "{span}");
+        let range = a.iter().zip(b).zip(device);
+        let nearest: Vec<f64> = range
+            .map(|((a, b), x)| x.clamp(a.min(*b), a.max(*b)))
+            .collect();
+        let (distance, cosine) = agreement(device, &nearest);
+        println!(
+            "{span}: relative L2 {distance:.1e}, 1 - cosine {:.1e}",
+            1.0 - cosine
+        );
+        assert!(
+            distance <= 1e-4 && cosine >= 0.99999,
+            "{span}: relative L2 {distance:.2e}, cosine {cosine}"
+        );
+    }
+}
+
+/// ‖ours − theirs‖/‖theirs‖ and the cosine between the two.
+pub fn agreement(ours: &[f64], theirs: &[f64]) -> (f64, f64) {
+    assert_eq!(ours.len(), theirs.len());
+    let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+    let error: f64 = ours.iter().zip(theirs).map(|(a, b)| (a - b).powi(2)).sum();
+    let (ours_length, length) = (dot(ours, ours).sqrt(), dot(theirs, theirs).sqrt());
+    (
+        error.sqrt() / length,
+        dot(ours, theirs) / (ours_length * length),
+    )
+}

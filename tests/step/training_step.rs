@@ -1,0 +1,290 @@
+//! `Trainer::step` in the middle of a run, in several configurations, against the twin given the same rays, draws and parameters.
+
+use crate::reference::batch::{Now, Outcome, Step};
+use crate::reference::optimizer::Adam;
+use crate::reference::sampling;
+use crate::reference::tape::ReluEdge;
+use crate::reference::trial::{self, Random};
+use crate::rig::{GradientRange, Rig, agreement, interleaved};
+use glam::dvec3;
+use neurodin::Result;
+use neurodin::config::{BackgroundKind, BiasReduction, Config};
+use neurodin::model::Group;
+use neurodin::render::TERMS;
+use neurodin::scene::RegionShape;
+use neurodin::train::StepLosses;
+use neurodin::train::schedule::{self, Schedule};
+use std::collections::BTreeMap;
+
+/// The checked step: late enough for every schedule to have moved, with a scale bound that holds for some samples.
+const STEP: u64 = 4;
+
+fn preset(name: &str) -> Config {
+    let preset = Config::preset(name).expect("a preset");
+    Config {
+        steps: 40,
+        rays: 40,
+        ..preset
+    }
+}
+
+#[test]
+fn outdoors_with_one_background_color() -> Result<()> {
+    check(preset("outdoor-tiny"), RegionShape::Sphere, 9)
+}
+
+#[test]
+fn indoors_in_a_box_with_the_published_bias_loss() -> Result<()> {
+    let mut config = preset("indoor-tiny");
+    config.rays = 100;
+    config.loss.bias.reduction = BiasReduction::Published;
+    let half = dvec3(1.0, 0.8, 0.9);
+    check(config, RegionShape::Box { half }, 9)
+}
+
+#[test]
+fn outdoors_with_a_background_field_and_appearance_codes() -> Result<()> {
+    let mut config = preset("outdoor-tiny");
+    config.background.kind = BackgroundKind::Field;
+    config.appearance.dims = 8;
+    config.hash.features = 4;
+    config.hash.log2_size = 14;
+    config.background.samples = 12;
+    config.background.max = 128;
+    check(config, RegionShape::Sphere, 9)
+}
+
+#[test]
+fn with_the_widths_of_the_large_configurations() -> Result<()> {
+    let mut config = preset("outdoor-large");
+    config.rays = 24;
+    config.hash.log2_size = 12;
+    config.sampling.proposal_log2_size = 12;
+    config.sampling.proposal_samples = [64, 48];
+    config.background.log2_size = 12;
+    check(config, RegionShape::Sphere, 9)
+}
+
+fn check(config: Config, shape: RegionShape, seed: u64) -> Result<()> {
+    let mut rig = Rig::new(config, shape)?;
+    for _ in 0..STEP {
+        rig.trainer.step()?;
+    }
+    let mut params = trial::parameters(&rig.twin, false, &mut Random(seed));
+    // Fine grids as rough as a trial's would leave little of the surface, and less of float32: a point is known to a ten-thousandth
+    // of a fine cell.
+    for name in ["surface.table", "background.table"] {
+        let values = params.get_mut(name).into_iter().flatten();
+        values.for_each(|x| *x *= 0.1);
+    }
+    rig.upload_parameters(&mut params)?;
+    let block = &rig.trainer.model().params;
+    let m0 = rig.download_spans(block.first_moment())?;
+    let v0 = rig.download_spans(block.second_moment())?;
+
+    rig.trainer.step()?;
+    let losses = rig.trainer.finish()?.expect("the losses of a step");
+    let now = Schedule::new(&rig.config).at(STEP);
+
+    let rays = rig.rays()?;
+    check_stretches(&rig, &rays);
+    let mut step = Step {
+        config: rig.twin.clone(),
+        params: params.clone(),
+        draws: rig.draws()?,
+        now: Now {
+            anneal: now.anneal,
+            inv_s_lower: now.inv_s_lower,
+            bias_weight: now.bias_weight,
+            inv_count: 1.0 / rig.n_rays() as f64,
+        },
+        rays,
+        edges: None,
+        points: None,
+        relu_edge: ReluEdge::default(),
+    };
+    let edges = rig.edges()?;
+    let own = step.run();
+    for (level, edges) in edges.iter().enumerate() {
+        // A resampled edge moves by its float32 error over the density of the weights there.
+        let error = edges
+            .iter()
+            .zip(&own.images.edges[level])
+            .map(|(a, b)| (a - b).abs());
+        let worst = error.fold(0.0, f64::max);
+        assert!(
+            worst < [1e-6, 1e-4, 1e-3][level],
+            "edges of level {level} are off by {worst:.2e}"
+        );
+    }
+
+    let points = rig.points()?.concat();
+    let (distance, _) = agreement(&points, &own.images.points.concat());
+    assert!(distance < 1e-3, "points: relative L2 {distance:.2e}");
+
+    // From here on with the device's own edges and points, so that errors do not add up.
+    step.edges = Some(edges);
+    step.points = Some(rig.points()?);
+    let twin = step.run();
+    check_images(&rig, &twin)?;
+    check_losses(&twin, &losses);
+    check_update(&rig, &GradientRange::of(&step), &params, [&m0, &v0], &now)?;
+    rig.check_device()
+}
+
+/// Rays meet the region where the twin's do.
+fn check_stretches(rig: &Rig, rays: &crate::reference::batch::Rays) {
+    let stretches = rays.stretches.as_ref().expect("the device's");
+    for (ray, device) in stretches.iter().enumerate() {
+        let twin = sampling::collide(rig.twin.region, rays.origins[ray], rays.directions[ray]);
+        assert_eq!(device.outside, twin.outside, "ray {ray}");
+        let error = (device.near - twin.near)
+            .abs()
+            .max((device.far - twin.far).abs());
+        assert!(
+            error < 1e-5,
+            "ray {ray} meets the region at {device:?}, and not {twin:?}"
+        );
+    }
+}
+
+/// Everything forward: normalised mean squared error of at most 1e-7.
+fn check_images(rig: &Rig, twin: &Outcome) -> Result<()> {
+    let render = rig.trainer.renderer();
+    let (surface, composite) = (&render.surface, &render.composite);
+    let (twin, n) = (&twin.images, rig.n_rays());
+    let samples = n * rig.twin.samples;
+    let shading = rig.download(&surface.shading)?;
+    let image = rig.download(&composite.image)?;
+    let gradient_rows = &shading[(1 + rig.twin.features) * samples..][..3 * samples];
+    let pairs = [
+        ("sdf", rig.download(&surface.sdf)?, twin.sdf.clone()),
+        (
+            "scale logit",
+            shading[..samples].to_vec(),
+            twin.logit.clone(),
+        ),
+        (
+            "gradient",
+            interleaved::<3>(gradient_rows).concat(),
+            twin.gradient.clone(),
+        ),
+        (
+            "sample colours",
+            interleaved::<3>(&rig.download(&surface.rgb)?).concat(),
+            twin.rgb.clone(),
+        ),
+        (
+            "weights",
+            rig.download(&composite.weights)?,
+            twin.weights.clone(),
+        ),
+        (
+            "background",
+            interleaved::<3>(&rig.download(&render.background.color)?).concat(),
+            twin.background.clone(),
+        ),
+        (
+            "colour",
+            interleaved::<3>(&image[..3 * n]).concat(),
+            twin.color.clone(),
+        ),
+        (
+            "accumulation",
+            image[3 * n..4 * n].to_vec(),
+            twin.accumulation.clone(),
+        ),
+        ("depth", image[5 * n..].to_vec(), twin.depth.clone()),
+    ];
+    for (what, device, twin) in pairs {
+        if twin.iter().all(|&x| x == 0.0) {
+            assert!(device.iter().all(|&x| x == 0.0), "{what} is not zero");
+            continue;
+        }
+        let (distance, _) = agreement(&device, &twin);
+        println!("{what}: NMSE {:.1e}", distance * distance);
+        assert!(
+            distance * distance <= 1e-7,
+            "{what}: NMSE {:.2e}",
+            distance * distance
+        );
+    }
+    // What is left behind the last sample is small where a ray is opaque: against 1, not against itself.
+    for (device, twin) in image[4 * n..5 * n].iter().zip(&twin.transmittance) {
+        assert!(
+            (device - twin).abs() < 1e-5,
+            "transmittance {device}, twin {twin}"
+        );
+    }
+    Ok(())
+}
+
+fn check_losses(twin: &Outcome, device: &StepLosses) {
+    assert_eq!(device.step, STEP);
+    let device = |name: &str| -> f64 {
+        let terms = TERMS
+            .iter()
+            .zip(&device.values)
+            .filter(|(term, _)| term.starts_with(name));
+        terms.map(|(_, &value)| f64::from(value)).sum()
+    };
+    for name in ["color", "eikonal", "interlevel", "bias"] {
+        let (device, twin) = (device(name), twin.losses[name]);
+        println!("{name} loss {twin:.6}, device {device:.6}");
+        assert!(twin > 0.0, "no {name} loss to test");
+        assert!(
+            (device - twin).abs() <= 1e-4 * twin,
+            "{name} loss {device}, twin {twin}"
+        );
+    }
+}
+
+/// The device's gradients, read off the first moments, against the twin's; and what AdamW makes of them.
+fn check_update(
+    rig: &Rig,
+    twin: &GradientRange,
+    params: &BTreeMap<String, Vec<f64>>,
+    [m0, v0]: [&BTreeMap<String, Vec<f64>>; 2],
+    now: &schedule::Now,
+) -> Result<()> {
+    let block = &rig.trainer.model().params;
+    let m1 = rig.download_spans(block.first_moment())?;
+    let p1 = rig.download_spans(block.values())?;
+    let left = rig.download(block.grads())?;
+    assert!(left.iter().all(|&g| g == 0.0), "gradients are consumed");
+    let optimizer = &rig.config.optimizer;
+    for span in block.spans().iter().filter(|span| !span.is_empty()) {
+        let name = &span.name;
+        // m1 = β₁ m0 + (1 − β₁) g
+        let beta = optimizer.beta1;
+        let gradient: Vec<f64> = m1[name]
+            .iter()
+            .zip(&m0[name])
+            .map(|(m1, m0)| (m1 - beta * m0) / (1.0 - beta))
+            .collect();
+        twin.check(name, &gradient);
+
+        let (rate, decay) = match span.group {
+            Group::Fields => (now.lr_fields, optimizer.fields.weight_decay),
+            Group::Table => (now.lr_table, optimizer.table.weight_decay),
+            Group::Proposal => (now.lr_proposal, optimizer.proposal.weight_decay),
+            Group::Background => (now.lr_background, optimizer.background.weight_decay),
+        };
+        assert!(rate > 0.0);
+        let betas = [optimizer.beta1, optimizer.beta2];
+        let mut adam = Adam::new(gradient.len(), betas, optimizer.epsilon, decay);
+        adam.steps = STEP as i32;
+        adam.m.clone_from(&m0[name]);
+        adam.v.clone_from(&v0[name]);
+        let mut expected = params[name].clone();
+        adam.update(&mut expected, &gradient, rate);
+        for (i, (device, twin)) in p1[name].iter().zip(&expected).enumerate() {
+            let allowed = 2e-7 * twin.abs() + 1e-4 * rate;
+            assert!(
+                (device - twin).abs() <= allowed,
+                "{name}[{i}] becomes {device}, and not {twin}"
+            );
+        }
+    }
+    Ok(())
+}
