@@ -62,6 +62,12 @@ fn main() {
         }
         std::process::exit(1);
     }
+    let stems = paths.iter().filter_map(|path| path.file_stem()?.to_str());
+    let modules: String = stems.map(|stem| format!("&{stem}::MODULE, ")).collect();
+    let _ = writeln!(
+        text,
+        "/// Every kernel, by name.\npub static ALL: &[&crate::gpu::KernelModule] = &[{modules}];"
+    );
     write_if_changed(&out.join("kernels.rs"), text.as_bytes());
 }
 
@@ -356,7 +362,7 @@ fn rust_module(stem: &str, source: &Source, module: &Module) -> Result<String, S
     }
     let _ = writeln!(
         w,
-        "static MODULE: crate::gpu::KernelModule = crate::gpu::KernelModule {{ name: {stem:?}, local_size: {:?}, spirv: {}, \
+        "pub(super) static MODULE: crate::gpu::KernelModule = crate::gpu::KernelModule {{ name: {stem:?}, local_size: {:?}, spirv: {}, \
          spirv_without_float_atomics: {fallback}, int64: {}, pointers: &[{pointers}], indirect_reads: {}, indirect_writes: {} }};\n}}",
         module.local_size,
         embed(""),

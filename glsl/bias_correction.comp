@@ -1,7 +1,7 @@
 #version 460
 #define LOCAL_SIZE 256
 #include "lib/prelude.glsl"
-// Explicit bias correction (NeuRodin, section 3.4): just behind the heaviest sample the signed distance should be negative.
+// Explicit bias correction (Wang et al. 2024, NeuRodin): just behind the heaviest sample the signed distance should be negative.
 //     hinge_r = max(sdf(P + eps d) + eps, 0) [sdf(P + offset d) > 0]
 //     loss_r = gate_r hinge_r              as the paper means it
 //     loss_r = mean(gate) hinge_r          as the published code computes it (published = 1): an outer product over the batch

@@ -4,9 +4,10 @@
 #include "lib/volume.glsl"
 // Adjoint of composite_forward's colour, one invocation per ray; every gradient is overwritten.
 //     g_i = d_color . (1.002 rgb_i - 0.001),  g_end = d_color . background                  what one unit of weight is worth
-//     R_end = g_end,  R_i = (1 - e^-tau_i) g_i + e^-tau_i R_{i+1}                           what a ray is worth from sample i on
-//     d_tau_i = T_{i+1} (g_i - R_{i+1}),  d_rgb_i = 1.002 w_i d_color,  d_background = T_end d_color
-// and through tau = sigma(sdf, inv_s(logit)) length. The recursion from the back has no sums of large terms to cancel.
+//     D_i = g_i - g_{i+1} + e^-tau_{i+1} D_{i+1}, from g_n = g_end, D_n = 0                 and how much more than all that it hides
+//     d_tau_i = T_{i+1} D_i,  d_rgb_i = 1.002 w_i d_color,  d_background = T_end d_color
+// and through tau = sigma(sdf, inv_s(logit)) length. The textbook's T_{i+1} g_i - sum_{j>i} w_j g_j - T_end g_end is the same number, but
+// cancels where neighbours have nearly one colour.
 layout(push_constant, scalar) uniform Args {
     F32s sdf;             // [n * n_samples] at bin starts
     F32s logit;           // [n * n_samples] of the local scale
@@ -55,7 +56,8 @@ void main() {
         d_background.at[channel * n + ray] = transmittance * d_pixel[channel];
 
     // Backward.
-    float rest = dot(d_pixel, behind); // R_{i+1}
+    float next_worth = dot(d_pixel, behind); // g_{i+1}
+    float passed = 0.0, advantage = 0.0;     // e^-tau_{i+1}, D_{i+1}
     float s1 = s0;
     for (uint k = 0u; k < n_samples; k++) {
         uint i = n_samples - 1u - k;
@@ -64,20 +66,21 @@ void main() {
         float bin = bin_length(span, s0, s1);
         LocalScale scale = local_scale(logit.at[p], scale_range, scale_floor, inv_s_lower);
         Density density = laplace_density(empty ? EMPTY_SDF : sdf.at[p], scale.inv_s);
-        float alpha = opacity(density.sigma * bin);
-        float after = d_sdf.at[p];
-        float before = 1.0;
-        if (i > 0u) before = d_sdf.at[p - 1u];
+        float tau = density.sigma * bin;
+        float weight = opacity(tau);
+        if (i > 0u) weight *= d_sdf.at[p - 1u];
 
         float worth = 0.0;
         [[unroll]] for (uint channel = 0u; channel < 3u; channel++) {
             worth += d_pixel[channel] * padded_rgb(rgb.at[channel * count + p]);
-            d_rgb.at[channel * count + p] = (1.0 + 2.0 * RGB_PADDING) * alpha * before * d_pixel[channel];
+            d_rgb.at[channel * count + p] = (1.0 + 2.0 * RGB_PADDING) * weight * d_pixel[channel];
         }
-        float d_sigma = after * (worth - rest) * bin;
+        advantage = worth - next_worth + passed * advantage;
+        float d_sigma = d_sdf.at[p] * advantage * bin;
         d_sdf.at[p] = d_sigma * density.d_sdf;
         d_logit.at[p] = d_sigma * density.d_inv_s * scale.d_logit;
-        rest += alpha * (worth - rest);
+        next_worth = worth;
+        passed = exp(-tau);
         s1 = s0;
     }
 }

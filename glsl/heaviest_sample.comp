@@ -1,7 +1,7 @@
 #version 460
 #include "lib/prelude.glsl"
 #include "lib/sampling.glsl"
-// The heaviest sample of every ray and the two points behind it where bias correction asks the surface network (NeuRodin, section 3.4):
+// The heaviest sample of every ray and the two points behind it where bias correction asks the surface network (Wang et al. 2024, NeuRodin):
 //     k = argmax_i w_i (the first of equals),  P = o + (t_k + t_{k+1})/2 d,  queries P + eps d and P + offset d
 //     gate = [min_i sdf_i < 0] and, where need_opaque, [sum_i w_i > 0.999]; closed on rays outside the region
 // One subgroup per ray, its lanes share the samples; any subgroup size and any number of groups is right, rays are strided over.

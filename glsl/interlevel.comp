@@ -7,7 +7,7 @@
 //     lo = clip(#{j < P: edge_j <= s_i} - 1, 0, P - 1),  hi = clip(#{j < P: edge_{j+1} <= s_{i+1}}, 0, P - 1)
 //     outer_i = sum_{m = lo..=hi} what_m,  loss_r = mean_i max(0, w_i - outer_i)^2 / (w_i + 1e-7)
 // The loss is scale * sum_r loss_r. Final edges and weights carry no gradient. Backwards through the quadrature as in composite_backward:
-//     R_end = 0,  R_m = (1 - e^-tau_m) d_what_m + e^-tau_m R_{m+1},  d_tau_m = T_{m+1} (d_what_m - R_{m+1})
+//     D_m = d_what_m - d_what_{m+1} + e^-tau_{m+1} D_{m+1}, from d_what_P = D_P = 0,  d_tau_m = T_{m+1} D_m
 // and through the truncated exponential: d_raw_m = d_tau_m length_m exp(clamp(raw_m, -15, 15)).
 layout(push_constant, scalar) uniform Args {
     F32s final_edges;      // [n, n_final + 1]
@@ -65,7 +65,7 @@ void main() {
     }
     loss.at[ray] = sum / float(n_final);
 
-    float rest = 0.0; // R_{m+1}
+    float next_worth = 0.0, passed = 0.0, advantage = 0.0; // d_what_{m+1}, e^-tau_{m+1}, D_{m+1}
     float s1 = s0;
     for (uint k = 0u; k < n_samples; k++) {
         uint m = n_samples - 1u - k;
@@ -73,8 +73,10 @@ void main() {
         float bin = bin_length(span, s0, s1);
         float out_m = raw.at[row + m];
         float worth = d_raw.at[row + m];
-        d_raw.at[row + m] = transmittance.at[row + m] * (worth - rest) * bin * proposal_density_slope(out_m);
-        rest += opacity(proposal_density(out_m) * bin) * (worth - rest);
+        advantage = worth - next_worth + passed * advantage;
+        d_raw.at[row + m] = transmittance.at[row + m] * advantage * bin * proposal_density_slope(out_m);
+        next_worth = worth;
+        passed = exp(-proposal_density(out_m) * bin);
         s1 = s0;
     }
 }

@@ -2,7 +2,7 @@
 #include "lib/prelude.glsl"
 #include "lib/sampling.glsl"
 #include "lib/volume.glsl"
-// New bins where a proposal's weights are, one invocation per ray (Barron et al. 2022, Mip-NeRF 360, section 5):
+// New bins where a proposal's weights are, one invocation per ray (Barron et al. 2022, Mip-NeRF 360):
 //     tau_i = exp(raw_i) length_i,  w_i = (1 - e^-tau_i) exp(-sum_{j<i} tau_j)                     the proposal's weights, kept for its loss
 //     h_i = w_i^anneal + 0.01,  c_i = sum_{j<i} h_j / sum_j h_j                                    a histogram that leaves no bin empty
 //     u_j = (j + xi) / n_edges with xi = draw (training) or 1/2,  edge_j = c^-1(u_j)               linear inside a bin, right-sided at ties

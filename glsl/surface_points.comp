@@ -2,7 +2,7 @@
 #include "lib/prelude.glsl"
 #include "lib/sampling.glsl"
 // Where the surface network is asked: the start of every bin, and around it the six taps of the finite-difference gradient, one
-// invocation per bin (NeuRodin, section 3.3: the step is random, one per sample).
+// invocation per bin (Wang et al. 2024, NeuRodin: the step is random, one per sample).
 //     x_i = o + t_i d,  delta = max(tap_range u, tap_floor),  taps x_i +- delta e_axis
 layout(push_constant, scalar) uniform Args {
     F32s origins;    // [3, n]

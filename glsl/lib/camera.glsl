@@ -40,7 +40,7 @@ vec2 camera_newton_step(vec2 w, vec2 target, vec4 numerator, vec3 denominator, v
     float yx = 2.0 * x * y * d_rho + 2.0 * p2 * y + 2.0 * p1 * x + 2.0 * prism.y * x;
     float yy = rho + 2.0 * y * y * d_rho + 2.0 * p2 * x + 6.0 * p1 * y + 2.0 * prism.y * y;
     float det = xx * yy - xy * yx;
-    if (abs(det) < 1e-6) return vec2(0.0);
+    if (!(abs(det) > 1e-6 && abs(det) < 1e30)) return vec2(0.0);  // a fold, a pole, or not a number
     vec2 move = vec2(yy * error.x - xy * error.y, xx * error.y - yx * error.x) / det;
     return move * min(1.0, 0.5 * (1.0 + length(w)) / max(length(move), 1e-30));
 }

@@ -1,7 +1,7 @@
 // Where along a ray the samples lie: normalised positions s in [0,1], distances t, and what is between.
 //
-// A ray's positions are kept in a warped distance S that is linear up to t = 1 and linear in disparity beyond it
-// (Barron et al. 2022, Mip-NeRF 360, section 5):
+// A ray's positions are kept in a warped distance S (Barron et al. 2022, Mip-NeRF 360) that is linear up to t = 1 and linear in disparity
+// beyond it:
 //     S(t) = t/2          for t < 1        S^-1(u) = 2u          for u < 1/2
 //            1 - 1/(2t)   for t >= 1                 1/(2 - 2u)  for u >= 1/2
 //     t(s) = S^-1(s S(far) + (1 - s) S(near))
@@ -45,7 +45,7 @@ float bin_midpoint(Span span, float s0, float s1) {
     return 0.5 * (distance_at(span, s0) + distance_at(span, s1));
 }
 
-// How far the six taps lie from their sample: U(0, range), not below the floor (METHOD 3).
+// How far the six taps lie from their sample: U(0, range), not below the floor (Wang et al. 2024, NeuRodin).
 float tap_step(float u, float range, float floor_) {
     return max(range * u, floor_);
 }

@@ -7,7 +7,7 @@ float opacity(float tau) {
     return tau < 0.35 ? series : 1.0 - exp(-tau);
 }
 
-// The inverse of the local Laplace scale beta, learned per sample (NeuRodin, section 3.2):
+// The inverse of the local Laplace scale beta, learned per sample (Wang et al. 2024, NeuRodin):
 //     inv_s = max(1 / (scale_range sigmoid(logit) + scale_floor), inv_s_lower)
 struct LocalScale {
     float inv_s;
@@ -52,7 +52,7 @@ float proposal_density_slope(float raw) {
     return exp(clamp(raw, -15.0, 15.0));
 }
 
-// The network's colour in (0,1) is stretched a little so that black and white can be reached (Mip-NeRF, appendix).
+// The network's colour in (0,1) is stretched a little so that black and white can be reached (Barron et al. 2021, Mip-NeRF).
 const float RGB_PADDING = 0.001;
 
 float padded_rgb(float rgb) {

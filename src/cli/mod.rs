@@ -1,5 +1,6 @@
 //! Module cli.
 
+pub mod demo;
 pub mod eval;
 pub mod inspect;
 pub mod scene_args;

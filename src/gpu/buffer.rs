@@ -1,25 +1,13 @@
-//! Device memory: buffers, the pointers that kernels take, and small buffers that the host reads while the device works.
-//!
-//! Every allocation ends in 64 KiB of padding. A loop over rows may touch one row past the end there (lavapipe 26.x runs a loop's body
-//! once more with an empty mask, and its uniform loads are not masked), and guard mode writes its words there.
+//! Buffers, the pointers that kernels take, and small buffers that the host reads while the device works.
 
-use super::device::{Context, Gpu, Inner, vulkan};
+use super::device::Gpu;
+use super::memory::{GUARD, POISON, Slab};
 use crate::{Error, Result};
-use ash::vk;
 use bytemuck::{Pod, Zeroable};
 use gpu_allocator::MemoryLocation;
-use gpu_allocator::vulkan::{
-    Allocation, AllocationCreateDesc, AllocationScheme, Allocator, AllocatorCreateDesc,
-};
-use std::collections::BTreeMap;
 use std::marker::PhantomData;
-use std::mem::ManuallyDrop;
 use std::ops::{Deref, Range};
-use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, RwLock};
-
-/// Padding behind every buffer, in bytes.
-pub(super) const PADDING: u64 = 64 << 10;
+use std::sync::Arc;
 
 /// A readable device pointer: what a kernel's `readonly` argument takes.
 #[repr(transparent)]
@@ -51,6 +39,12 @@ macro_rules! pointer {
         impl<T> std::fmt::Debug for $name<T> {
             fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
                 write!(f, "{}({:#x})", stringify!($name), self.address())
+            }
+        }
+        /// As GLSL's uvec2: for structures that hold addresses as numbers.
+        impl<T> From<$name<T>> for [u32; 2] {
+            fn from(pointer: $name<T>) -> Self {
+                pointer.words
             }
         }
         // SAFETY: two words and nothing else; any bits are a value, whatever T is.
@@ -211,196 +205,6 @@ impl<T: Pod> Readback<T> {
     }
 }
 
-/// A buffer's memory, freed when the last handle goes.
-pub(super) struct Slab {
-    pub(super) parts: ManuallyDrop<Parts>,
-    pub(super) id: u64,
-    pub(super) name: String,
-    /// Bytes without padding.
-    pub(super) bytes: u64,
-    inner: Arc<Inner>,
-}
-
-impl Drop for Slab {
-    fn drop(&mut self) {
-        // SAFETY: taken once, here.
-        let parts = unsafe { ManuallyDrop::take(&mut self.parts) };
-        self.inner.memory.forget(parts.address);
-        self.inner.queue.discard(&self.inner.memory, parts);
-    }
-}
-
-/// Vulkan's side of a buffer.
-pub(super) struct Parts {
-    pub(super) raw: vk::Buffer,
-    pub(super) address: u64,
-    /// Bytes with padding.
-    pub(super) size: u64,
-    allocation: Allocation,
-}
-
-impl Parts {
-    /// Copies mapped memory out.
-    pub(super) fn read(&self, offset: u64, out: &mut [u8]) {
-        let mapped = self.mapped(offset, out.len());
-        // SAFETY: `mapped` proved the range to be mapped; the device is done with it (the caller waited).
-        unsafe { std::ptr::copy_nonoverlapping(mapped, out.as_mut_ptr(), out.len()) };
-    }
-
-    /// Copies into mapped memory.
-    pub(super) fn write(&self, offset: u64, data: &[u8]) {
-        let mapped = self.mapped(offset, data.len());
-        // SAFETY: as above; and only the staging buffer is written, under its lock.
-        unsafe { std::ptr::copy_nonoverlapping(data.as_ptr(), mapped, data.len()) };
-    }
-
-    fn mapped(&self, offset: u64, len: usize) -> *mut u8 {
-        assert!(
-            offset + len as u64 <= self.size,
-            "bytes {offset} + {len} of {}",
-            self.size
-        );
-        let start = self
-            .allocation
-            .mapped_ptr()
-            .expect("host-visible memory is mapped");
-        // SAFETY: within the allocation, as asserted.
-        unsafe { start.as_ptr().cast::<u8>().add(offset as usize) }
-    }
-}
-
-/// A live allocation, as the recorder finds it by address.
-pub(super) struct Span {
-    pub(super) id: u64,
-    pub(super) bytes: u64,
-    pub(super) name: String,
-}
-
-/// The allocator, and what is alive.
-pub(super) struct Memory {
-    allocator: Mutex<ManuallyDrop<Allocator>>,
-    pub(super) live: RwLock<BTreeMap<u64, Span>>,
-    /// Host memory that uploads and downloads pass through.
-    pub(super) staging: Mutex<Option<Parts>>,
-    next_id: AtomicU64,
-    device: ash::Device,
-}
-
-impl Memory {
-    pub(super) fn new(context: &Context) -> Result<Memory> {
-        let allocator = Allocator::new(&AllocatorCreateDesc {
-            instance: context.instance.raw.clone(),
-            device: context.device.clone(),
-            physical_device: context.physical,
-            debug_settings: Default::default(),
-            buffer_device_address: true,
-            allocation_sizes: Default::default(),
-        });
-        let allocator = allocator.map_err(|error| Error::OutOfMemory {
-            what: format!("the allocator did not start: {error}"),
-        })?;
-        Ok(Memory {
-            allocator: Mutex::new(ManuallyDrop::new(allocator)),
-            live: RwLock::new(BTreeMap::new()),
-            staging: Mutex::new(None),
-            next_id: AtomicU64::new(1),
-            device: context.device.clone(),
-        })
-    }
-
-    /// A buffer of `bytes` and padding.
-    pub(super) fn allocate(
-        &self,
-        context: &Context,
-        name: &str,
-        bytes: u64,
-        location: MemoryLocation,
-    ) -> Result<Parts> {
-        let size = bytes.next_multiple_of(16) + PADDING;
-        let usage = vk::BufferUsageFlags::STORAGE_BUFFER
-            | vk::BufferUsageFlags::TRANSFER_SRC
-            | vk::BufferUsageFlags::TRANSFER_DST
-            | vk::BufferUsageFlags::SHADER_DEVICE_ADDRESS;
-        let create = vk::BufferCreateInfo::default().size(size).usage(usage);
-        // SAFETY: a live device.
-        let raw = unsafe { self.device.create_buffer(&create, None) }
-            .map_err(vulkan("vkCreateBuffer"))?;
-        // SAFETY: the buffer made just now.
-        let requirements = unsafe { self.device.get_buffer_memory_requirements(raw) };
-        let wanted = AllocationCreateDesc {
-            name,
-            requirements,
-            location,
-            linear: true,
-            allocation_scheme: AllocationScheme::GpuAllocatorManaged,
-        };
-        let allocation = self
-            .allocator
-            .lock()
-            .expect("no panic under the lock")
-            .allocate(&wanted);
-        let allocation = allocation.map_err(|error| {
-            // SAFETY: nothing uses it yet.
-            unsafe { self.device.destroy_buffer(raw, None) };
-            Error::OutOfMemory {
-                what: format!("buffer '{name}' of {bytes} bytes: {error}"),
-            }
-        })?;
-        // SAFETY: fresh buffer, memory of a type that it allows, at the offset that the allocator aligned.
-        let bound = unsafe {
-            self.device
-                .bind_buffer_memory(raw, allocation.memory(), allocation.offset())
-        };
-        let info = vk::BufferDeviceAddressInfo::default().buffer(raw);
-        let address = match bound {
-            // SAFETY: bound, and made with SHADER_DEVICE_ADDRESS.
-            Ok(()) => unsafe { self.device.get_buffer_device_address(&info) },
-            Err(_) => 0,
-        };
-        let parts = Parts {
-            raw,
-            address,
-            size,
-            allocation,
-        };
-        if let Err(error) = bound {
-            self.free(parts);
-            return Err(vulkan("vkBindBufferMemory")(error));
-        }
-        context.name(raw, name);
-        Ok(parts)
-    }
-
-    /// Frees memory that nothing uses any more.
-    pub(super) fn free(&self, parts: Parts) {
-        // SAFETY: the caller knows that the device is done with it.
-        unsafe { self.device.destroy_buffer(parts.raw, None) };
-        let freed = self
-            .allocator
-            .lock()
-            .expect("no panic under the lock")
-            .free(parts.allocation);
-        debug_assert!(freed.is_ok(), "{freed:?}");
-    }
-
-    fn forget(&self, address: u64) {
-        self.live
-            .write()
-            .expect("no panic under the lock")
-            .remove(&address);
-    }
-}
-
-impl Drop for Memory {
-    fn drop(&mut self) {
-        if let Some(parts) = self.staging.lock().expect("no panic under the lock").take() {
-            self.free(parts);
-        }
-        // SAFETY: dropped once, here, before the device.
-        unsafe { ManuallyDrop::drop(&mut self.allocator.lock().expect("no panic under the lock")) };
-    }
-}
-
 impl Gpu {
     /// `len` zeros in device memory. Fails with [`Error::OutOfMemory`] where they do not fit.
     pub fn buffer<T: Pod>(&self, name: &str, len: u64) -> Result<Buffer<T>> {
@@ -431,48 +235,32 @@ impl Gpu {
         len: u64,
         location: MemoryLocation,
     ) -> Result<Buffer<T>> {
-        let memory = &self.inner.memory;
+        assert!(size_of::<T>() > 0, "{name}: elements without size");
         let bytes = len
             .checked_mul(size_of::<T>() as u64)
             .filter(|&bytes| bytes < 1 << 46);
         let bytes = bytes.ok_or_else(|| Error::OutOfMemory {
-            what: format!("buffer '{name}' of {len} elements is beyond any device"),
+            what: format!(
+                "buffer '{name}' of {len} elements is beyond any device\n  next: ask for less"
+            ),
         })?;
-        let parts = memory.allocate(&self.inner.context, name, bytes, location)?;
-        let id = memory.next_id.fetch_add(1, Ordering::Relaxed);
-        let span = Span {
-            id,
-            bytes,
-            name: name.to_string(),
-        };
-        memory
-            .live
-            .write()
-            .expect("no panic under the lock")
-            .insert(parts.address, span);
-        let slab = Slab {
-            parts: ManuallyDrop::new(parts),
-            id,
-            name: name.to_string(),
-            bytes,
-            inner: self.inner.clone(),
-        };
+        let slab = Slab::new(&self.inner, name, bytes, location)?;
         Ok(Buffer {
-            slab: Arc::new(slab),
+            slab,
             len,
             of: PhantomData,
         })
     }
 
-    /// First content of a buffer; waits for it, since the host may touch a readback next.
+    /// First content of a buffer and of what lies behind it; waits, since the host may touch a readback next.
     fn fill_new<T: Pod>(&self, buffer: &Buffer<T>, word: u32) -> Result<()> {
         let ticket = self.submit("new buffer", |rec| {
-            rec.fill_bytes(&buffer.slab, 0..buffer.slab.parts.size, word);
+            let end = buffer.slab.guard_start();
+            rec.fill_bytes(&buffer.slab, 0..end, word);
+            let behind = if self.inner.options.guard { GUARD } else { 0 };
+            rec.fill_bytes(&buffer.slab, end..buffer.slab.parts.size, behind);
             Ok(())
         })?;
         self.wait(ticket)
     }
 }
-
-/// A quiet NaN that no computation makes.
-pub(super) const POISON: u32 = 0x7fc0_dead;

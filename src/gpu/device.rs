@@ -1,14 +1,15 @@
-//! The instance, the choice of a device, and the handle that everything else hangs on.
-//!
-//! Needed: Vulkan 1.2 with buffer device addresses, scalar block layout and timeline semaphores, and the subgroup operations that
-//! lib/prelude.glsl names. Used where present: float atomics, 64-bit integers, full subgroups, memory budgets, debug names.
+//! The device: how it is opened, and the handle that everything else hangs on.
 
-use super::buffer::Memory;
+use super::instance::{DeviceInfo, Instance, choose};
 use super::kernel::Pipelines;
+use super::memory::Memory;
+use super::profile::Profiler;
 use super::queue::Queue;
+use super::validation::ValidationLog;
 use crate::{Error, Result};
 use ash::{ext, khr, vk};
 use std::ffi::CStr;
+use std::path::PathBuf;
 use std::sync::Arc;
 
 /// Which device, and how closely it is watched.
@@ -24,61 +25,13 @@ pub struct GpuOptions {
     pub barrier_everywhere: bool,
     /// Times every launch. Launches are kept apart by barriers, so that a row's time is its own.
     pub profile: bool,
-}
-
-/// What kind of device this is; also the order in which devices are preferred.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub enum DeviceKind {
-    Discrete,
-    Integrated,
-    Virtual,
-    Cpu,
-    Other,
-}
-
-impl std::fmt::Display for DeviceKind {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str(match self {
-            DeviceKind::Discrete => "discrete",
-            DeviceKind::Integrated => "integrated",
-            DeviceKind::Virtual => "virtual",
-            DeviceKind::Cpu => "cpu",
-            DeviceKind::Other => "other",
-        })
-    }
-}
-
-/// A device as the driver describes it.
-#[derive(Clone, Debug)]
-pub struct DeviceInfo {
-    /// Position in [`Gpu::list`], accepted by [`GpuOptions::device`].
-    pub index: usize,
-    pub name: String,
-    pub kind: DeviceKind,
-    /// Driver's name and version, as it reports them.
-    pub driver: String,
-    /// Vulkan version of the device: (major, minor, patch).
-    pub vulkan: (u32, u32, u32),
-    /// Bytes of the largest device-local heap.
-    pub memory: u64,
-    /// Largest single allocation in bytes, and with it the largest buffer.
-    pub max_buffer: u64,
-    /// Invocations per subgroup.
-    pub subgroup_size: u32,
-    /// Shared memory per workgroup in bytes.
-    pub shared_memory: u32,
-    /// Invocations per workgroup.
-    pub max_workgroup: u32,
-    /// Whether floats in memory can be added to atomically; otherwise a compare-and-swap loop does it.
-    pub float_atomics: bool,
-    /// What this device lacks to run the kernels; empty where it can.
-    pub missing: Vec<String>,
-    pub(super) int64: bool,
-    pub(super) timestamp_period: f64,
-    pub(super) cache_uuid: [u8; 16],
-    pub(super) driver_version: u32,
-    /// (smallest, largest) subgroup size where full subgroups can be asked for.
-    pub(super) full_subgroups: Option<(u32, u32)>,
+    /// Ignores what only some devices offer, so that the variants run that run everywhere.
+    pub portable: bool,
+    /// Bytes of device memory that buffers may take; `None`: what the device has.
+    pub memory_limit: Option<u64>,
+    /// Folder that keeps compiled pipelines from one run to the next; `None` keeps none. (Software drivers have their own cache and
+    /// ignore this one.)
+    pub cache_dir: Option<PathBuf>,
 }
 
 /// A Vulkan device, ready to work. Cheap to clone; all clones are the same device.
@@ -92,6 +45,7 @@ pub(super) struct Inner {
     pub(super) queue: Queue,
     pub(super) pipelines: Pipelines,
     pub(super) memory: Memory,
+    pub(super) profiler: Profiler,
     pub(super) info: DeviceInfo,
     pub(super) options: GpuOptions,
     pub(super) context: Context,
@@ -104,6 +58,8 @@ pub(super) struct Context {
     pub(super) debug: Option<ext::debug_utils::Device>,
     pub(super) queue: vk::Queue,
     pub(super) family: u32,
+    pub(super) has_memory_budget: bool,
+    pub(super) timestamp_bits: u32,
     pub(super) instance: Instance,
 }
 
@@ -111,20 +67,6 @@ impl Drop for Context {
     fn drop(&mut self) {
         // SAFETY: everything made from the device is gone, and nothing runs on it: Queue waited when it was dropped.
         unsafe { self.device.destroy_device(None) };
-    }
-}
-
-/// Loader and instance.
-pub(super) struct Instance {
-    pub(super) raw: ash::Instance,
-    has_debug_utils: bool,
-    _entry: ash::Entry,
-}
-
-impl Drop for Instance {
-    fn drop(&mut self) {
-        // SAFETY: the device made from it is gone.
-        unsafe { self.raw.destroy_instance(None) };
     }
 }
 
@@ -137,30 +79,43 @@ impl std::fmt::Debug for Gpu {
 impl Gpu {
     /// Opens a device. Fails with [`Error::NoDevice`] where there is no Vulkan, no device of that name, or none that can run the kernels.
     pub fn new(options: &GpuOptions) -> Result<Gpu> {
-        let instance = Instance::new(options)?;
+        let instance = Instance::new(options.validation)?;
         let devices = instance.devices()?;
         let chosen = choose(&devices, options.device.as_deref())?;
-        let (physical, info) = devices.into_iter().nth(chosen).expect("chosen from these");
+        let (physical, mut info) = devices.into_iter().nth(chosen).expect("chosen from these");
+        if options.portable {
+            info.float_atomics = false;
+            info.full_subgroups = None;
+        }
         let context = Context::new(instance, physical, &info)?;
-        let memory = Memory::new(&context)?;
-        let pipelines = Pipelines::new(&context)?;
+        let memory = Memory::new(&context, options.memory_limit)?;
+        let pipelines = Pipelines::new(&context, &info, options.cache_dir.as_deref())?;
         let queue = Queue::new(&context)?;
+        let profiler = Profiler::new(&info, context.timestamp_bits);
+        if options.profile {
+            profiler.check(&info)?;
+        }
         let inner = Inner {
             queue,
             pipelines,
             memory,
+            profiler,
             info,
             options: options.clone(),
             context,
         };
-        Ok(Gpu {
+        let gpu = Gpu {
             inner: Arc::new(inner),
-        })
+        };
+        if options.profile {
+            gpu.set_clock()?;
+        }
+        Ok(gpu)
     }
 
     /// All devices that drivers offer, also those that cannot run the kernels ([`DeviceInfo::missing`]).
     pub fn list() -> Result<Vec<DeviceInfo>> {
-        let instance = Instance::new(&GpuOptions::default())?;
+        let instance = Instance::new(false)?;
         Ok(instance
             .devices()?
             .into_iter()
@@ -171,6 +126,16 @@ impl Gpu {
     /// The device in use.
     pub fn info(&self) -> &DeviceInfo {
         &self.inner.info
+    }
+
+    /// What the validation layer has said so far; nothing where the device was opened without [`GpuOptions::validation`].
+    pub fn validation_messages(&self) -> Vec<String> {
+        self.validation_log().messages()
+    }
+
+    /// The layer's log, which outlives the device: what was leaked is reported when the device goes.
+    pub fn validation_log(&self) -> ValidationLog {
+        self.inner.context.instance.log.clone()
     }
 
     /// How it was opened.
@@ -188,278 +153,6 @@ impl Drop for Inner {
 impl Inner {
     pub(super) fn device(&self) -> &ash::Device {
         &self.context.device
-    }
-}
-
-/// Index of the device that `wanted` means, or of the best.
-fn choose(devices: &[(vk::PhysicalDevice, DeviceInfo)], wanted: Option<&str>) -> Result<usize> {
-    let listing = || {
-        let lines = devices.iter().map(|(_, info)| {
-            format!(
-                "\n  {}: {} ({}, {})",
-                info.index, info.name, info.kind, info.driver
-            )
-        });
-        lines.collect::<String>()
-    };
-    let no_device = |what: String| Err(Error::NoDevice { what });
-    if devices.is_empty() {
-        return no_device(
-            "no Vulkan device: a loader is installed, but no driver offers a device\n  next: install your GPU's Vulkan driver, or \
-             Mesa's software device (package mesa-vulkan-drivers)"
-                .into(),
-        );
-    }
-    let chosen = match wanted {
-        Some(wanted) => {
-            let by_index = wanted
-                .parse::<usize>()
-                .ok()
-                .filter(|&index| index < devices.len());
-            let lower = wanted.to_lowercase();
-            let by_name = || {
-                devices
-                    .iter()
-                    .position(|(_, info)| info.name.to_lowercase().contains(&lower))
-            };
-            match by_index.or_else(by_name) {
-                Some(index) => index,
-                None => {
-                    return no_device(format!(
-                        "no Vulkan device \"{wanted}\"; there are{}\n  next: name one by its number or part of its name",
-                        listing()
-                    ));
-                }
-            }
-        }
-        None => {
-            let able = devices.iter().filter(|(_, info)| info.missing.is_empty());
-            match able.min_by_key(|(_, info)| info.kind) {
-                Some((_, info)) => info.index,
-                None => 0,
-            }
-        }
-    };
-    let info = &devices[chosen].1;
-    if !info.missing.is_empty() {
-        let missing = info.missing.join(", ");
-        return no_device(format!(
-            "{} lacks {missing}; there are{}\n  next: update its driver or choose another device",
-            info.name,
-            listing()
-        ));
-    }
-    Ok(chosen)
-}
-
-impl Instance {
-    fn new(_options: &GpuOptions) -> Result<Instance> {
-        // SAFETY: loading the Vulkan loader runs its initialisers, as every Vulkan program does.
-        let entry = unsafe { ash::Entry::load() }.map_err(|error| Error::NoDevice {
-            what: format!("no Vulkan loader: {error}\n  next: install a Vulkan driver (Debian, Ubuntu: libvulkan1 and mesa-vulkan-drivers)"),
-        })?;
-        let no_instance = |error: vk::Result| Error::NoDevice {
-            what: format!(
-                "no Vulkan instance: {error}\n  next: install or update your GPU's Vulkan driver"
-            ),
-        };
-        // SAFETY: a loaded entry; the call only reads.
-        let offered =
-            unsafe { entry.enumerate_instance_extension_properties(None) }.map_err(no_instance)?;
-        let offers = |name: &CStr| {
-            offered
-                .iter()
-                .any(|e| e.extension_name_as_c_str() == Ok(name))
-        };
-        let mut extensions = Vec::new();
-        let mut flags = vk::InstanceCreateFlags::empty();
-        if offers(khr::portability_enumeration::NAME) {
-            extensions.push(khr::portability_enumeration::NAME.as_ptr());
-            flags |= vk::InstanceCreateFlags::ENUMERATE_PORTABILITY_KHR;
-        }
-        let has_debug_utils = offers(ext::debug_utils::NAME);
-        if has_debug_utils {
-            extensions.push(ext::debug_utils::NAME.as_ptr());
-        }
-        let application = vk::ApplicationInfo::default()
-            .application_name(c"neurodin")
-            .api_version(vk::API_VERSION_1_3);
-        let create = vk::InstanceCreateInfo::default()
-            .flags(flags)
-            .application_info(&application)
-            .enabled_extension_names(&extensions);
-        // SAFETY: every pointer in `create` outlives the call.
-        let raw = unsafe { entry.create_instance(&create, None) }.map_err(no_instance)?;
-        Ok(Instance {
-            raw,
-            has_debug_utils,
-            _entry: entry,
-        })
-    }
-
-    fn devices(&self) -> Result<Vec<(vk::PhysicalDevice, DeviceInfo)>> {
-        // SAFETY: a live instance.
-        let devices = unsafe { self.raw.enumerate_physical_devices() };
-        let devices = devices.map_err(vulkan("vkEnumeratePhysicalDevices"))?;
-        devices
-            .into_iter()
-            .enumerate()
-            .map(|(index, physical)| Ok((physical, self.describe(index, physical)?)))
-            .collect()
-    }
-
-    fn extensions(&self, physical: vk::PhysicalDevice) -> Result<Vec<vk::ExtensionProperties>> {
-        // SAFETY: a device of this instance.
-        unsafe { self.raw.enumerate_device_extension_properties(physical) }
-            .map_err(vulkan("vkEnumerateDeviceExtensionProperties"))
-    }
-
-    fn describe(&self, index: usize, physical: vk::PhysicalDevice) -> Result<DeviceInfo> {
-        let extensions = self.extensions(physical)?;
-        let offers = |name: &CStr| {
-            extensions
-                .iter()
-                .any(|e| e.extension_name_as_c_str() == Ok(name))
-        };
-        // SAFETY: a device of this instance; Vulkan 1.0 call.
-        let first = unsafe { self.raw.get_physical_device_properties(physical) };
-        let version = first.api_version;
-        let vulkan = (
-            vk::api_version_major(version),
-            vk::api_version_minor(version),
-            vk::api_version_patch(version),
-        );
-        let text = |name: std::result::Result<&CStr, _>| {
-            name.map(|n: &CStr| n.to_string_lossy().into_owned())
-                .unwrap_or_default()
-        };
-        let mut info = DeviceInfo {
-            index,
-            name: text(first.device_name_as_c_str().map_err(drop)),
-            kind: match first.device_type {
-                vk::PhysicalDeviceType::DISCRETE_GPU => DeviceKind::Discrete,
-                vk::PhysicalDeviceType::INTEGRATED_GPU => DeviceKind::Integrated,
-                vk::PhysicalDeviceType::VIRTUAL_GPU => DeviceKind::Virtual,
-                vk::PhysicalDeviceType::CPU => DeviceKind::Cpu,
-                _ => DeviceKind::Other,
-            },
-            driver: String::new(),
-            vulkan,
-            memory: 0,
-            max_buffer: 0,
-            subgroup_size: 0,
-            shared_memory: first.limits.max_compute_shared_memory_size,
-            max_workgroup: first.limits.max_compute_work_group_invocations,
-            float_atomics: false,
-            missing: Vec::new(),
-            int64: false,
-            timestamp_period: 0.0,
-            cache_uuid: first.pipeline_cache_uuid,
-            driver_version: first.driver_version,
-            full_subgroups: None,
-        };
-        // SAFETY: a device of this instance; Vulkan 1.0 call.
-        let heaps = unsafe { self.raw.get_physical_device_memory_properties(physical) };
-        let local = heaps
-            .memory_heaps_as_slice()
-            .iter()
-            .filter(|heap| heap.flags.contains(vk::MemoryHeapFlags::DEVICE_LOCAL));
-        info.memory = local.map(|heap| heap.size).max().unwrap_or(0);
-        if version < vk::API_VERSION_1_2 {
-            info.missing
-                .push(format!("Vulkan 1.2 (it has {}.{})", vulkan.0, vulkan.1));
-            return Ok(info);
-        }
-
-        let atomics_offered = offers(ext::shader_atomic_float::NAME);
-        let size_control_offered =
-            version >= vk::API_VERSION_1_3 || offers(ext::subgroup_size_control::NAME);
-        let mut subgroups = vk::PhysicalDeviceSubgroupProperties::default();
-        let mut sizes = vk::PhysicalDeviceSubgroupSizeControlProperties::default();
-        let mut eleven = vk::PhysicalDeviceMaintenance3Properties::default();
-        let mut driver = vk::PhysicalDeviceDriverProperties::default();
-        let mut properties = vk::PhysicalDeviceProperties2::default()
-            .push_next(&mut subgroups)
-            .push_next(&mut eleven)
-            .push_next(&mut driver);
-        if size_control_offered {
-            properties = properties.push_next(&mut sizes);
-        }
-        // SAFETY: a Vulkan 1.2 device; the chain's structures outlive the call.
-        unsafe {
-            self.raw
-                .get_physical_device_properties2(physical, &mut properties)
-        };
-        let limits = properties.properties.limits;
-        let mut twelve = vk::PhysicalDeviceVulkan12Features::default();
-        let mut atomics = vk::PhysicalDeviceShaderAtomicFloatFeaturesEXT::default();
-        let mut control = vk::PhysicalDeviceSubgroupSizeControlFeatures::default();
-        let mut features = vk::PhysicalDeviceFeatures2::default().push_next(&mut twelve);
-        if atomics_offered {
-            features = features.push_next(&mut atomics);
-        }
-        if size_control_offered {
-            features = features.push_next(&mut control);
-        }
-        // SAFETY: as above.
-        unsafe {
-            self.raw
-                .get_physical_device_features2(physical, &mut features)
-        };
-        info.int64 = features.features.shader_int64 != 0;
-        info.driver = format!(
-            "{} {}",
-            text(driver.driver_name_as_c_str().map_err(drop)),
-            text(driver.driver_info_as_c_str().map_err(drop))
-        );
-        info.max_buffer = eleven.max_memory_allocation_size;
-        info.subgroup_size = subgroups.subgroup_size;
-        info.float_atomics = atomics.shader_buffer_float32_atomic_add != 0;
-        info.timestamp_period = limits.timestamp_period as f64;
-        if control.compute_full_subgroups != 0
-            && sizes
-                .required_subgroup_size_stages
-                .contains(vk::ShaderStageFlags::COMPUTE)
-        {
-            info.full_subgroups = Some((sizes.min_subgroup_size, sizes.max_subgroup_size));
-        }
-
-        let mut need = |there: bool, what: &str| {
-            if !there {
-                info.missing.push(what.into());
-            }
-        };
-        need(twelve.buffer_device_address != 0, "buffer device addresses");
-        need(twelve.scalar_block_layout != 0, "scalar block layout");
-        need(twelve.timeline_semaphore != 0, "timeline semaphores");
-        need(
-            subgroups
-                .supported_stages
-                .contains(vk::ShaderStageFlags::COMPUTE),
-            "subgroups in compute shaders",
-        );
-        let operations = [
-            (vk::SubgroupFeatureFlags::BASIC, "basic subgroup operations"),
-            (vk::SubgroupFeatureFlags::VOTE, "subgroup votes"),
-            (vk::SubgroupFeatureFlags::ARITHMETIC, "subgroup arithmetic"),
-            (vk::SubgroupFeatureFlags::BALLOT, "subgroup ballots"),
-            (vk::SubgroupFeatureFlags::SHUFFLE, "subgroup shuffles"),
-        ];
-        for (operation, what) in operations {
-            need(subgroups.supported_operations.contains(operation), what);
-        }
-        // SAFETY: a device of this instance.
-        let families = unsafe {
-            self.raw
-                .get_physical_device_queue_family_properties(physical)
-        };
-        need(
-            families
-                .iter()
-                .any(|family| family.queue_flags.contains(vk::QueueFlags::COMPUTE)),
-            "a compute queue",
-        );
-        Ok(info)
     }
 }
 
@@ -492,7 +185,8 @@ impl Context {
         if info.full_subgroups.is_some() && !size_control_is_core {
             names.push(ext::subgroup_size_control::NAME.as_ptr());
         }
-        if offers(ext::memory_budget::NAME) {
+        let has_memory_budget = offers(ext::memory_budget::NAME);
+        if has_memory_budget {
             names.push(ext::memory_budget::NAME.as_ptr());
         }
         if offers(khr::portability_subset::NAME) {
@@ -537,6 +231,8 @@ impl Context {
             debug,
             queue,
             family,
+            has_memory_budget,
+            timestamp_bits: families[family as usize].timestamp_valid_bits,
             instance,
         })
     }

@@ -1,11 +1,13 @@
 //! Kernels: pipelines built from the SPIR-V that build.rs embedded, one for each set of specialisation constants.
 
-use super::device::{Context, DeviceInfo, Gpu, vulkan};
+use super::device::{Context, Gpu, vulkan};
+use super::instance::DeviceInfo;
 use crate::{Error, Result};
 use ash::vk;
 use bytemuck::Pod;
 use std::collections::HashMap;
 use std::marker::PhantomData;
+use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 
 /// What build.rs found in a kernel's SPIR-V.
@@ -75,7 +77,7 @@ impl<A> std::fmt::Debug for Kernel<A> {
 }
 
 impl<A> Kernel<A> {
-    /// The same kernel under its own profiler row, "<stem> <label>".
+    /// The same kernel under its own profiler row: its name, a space, `label`.
     pub fn labelled(&self, label: &str) -> Kernel<A> {
         Kernel {
             row: format!("{} {label}", self.module.name).into(),
@@ -101,6 +103,9 @@ type Key = (&'static str, Vec<(u32, u32)>);
 pub(super) struct Pipelines {
     pub(super) layout: vk::PipelineLayout,
     built: Mutex<HashMap<Key, (vk::Pipeline, Arc<str>)>>,
+    cache: vk::PipelineCache,
+    /// Where the cache lies on disk, and its bytes when it was read.
+    cache_file: Option<(PathBuf, usize)>,
     device: ash::Device,
 }
 
@@ -108,19 +113,60 @@ pub(super) struct Pipelines {
 const PUSH_CONSTANT_BYTES: u32 = 128;
 
 impl Pipelines {
-    pub(super) fn new(context: &Context) -> Result<Pipelines> {
+    pub(super) fn new(
+        context: &Context,
+        info: &DeviceInfo,
+        cache_dir: Option<&Path>,
+    ) -> Result<Pipelines> {
+        let device = &context.device;
+        let cache_file = cache_dir.map(|dir| dir.join(cache_name(info)));
+        let known = cache_file
+            .as_ref()
+            .and_then(|file| std::fs::read(file).ok())
+            .filter(|data| is_for(data, info))
+            .unwrap_or_default();
+        let create = vk::PipelineCacheCreateInfo::default().initial_data(&known);
+        // SAFETY: a live device; data with this device's header, which drivers check once more.
+        let cache = unsafe { device.create_pipeline_cache(&create, None) }
+            .map_err(vulkan("vkCreatePipelineCache"))?;
+        let cache_file = cache_file.map(|file| (file, known.len()));
         let ranges = [vk::PushConstantRange::default()
             .stage_flags(vk::ShaderStageFlags::COMPUTE)
             .size(PUSH_CONSTANT_BYTES)];
         let create = vk::PipelineLayoutCreateInfo::default().push_constant_ranges(&ranges);
         // SAFETY: a live device.
-        let layout = unsafe { context.device.create_pipeline_layout(&create, None) }
-            .map_err(vulkan("vkCreatePipelineLayout"))?;
+        let layout = unsafe { device.create_pipeline_layout(&create, None) };
+        let layout = layout.map_err(|error| {
+            // SAFETY: nothing uses it yet.
+            unsafe { device.destroy_pipeline_cache(cache, None) };
+            vulkan("vkCreatePipelineLayout")(error)
+        })?;
         Ok(Pipelines {
             layout,
-            built: Mutex::new(HashMap::new()),
-            device: context.device.clone(),
+            built: Mutex::default(),
+            cache,
+            cache_file,
+            device: device.clone(),
         })
+    }
+
+    /// Writes the cache where it has grown: first beside its place, then into it, so that a reader never meets half a file.
+    fn save(&self) -> Result<()> {
+        let Some((file, known)) = &self.cache_file else {
+            return Ok(());
+        };
+        // SAFETY: a live cache.
+        let data = unsafe { self.device.get_pipeline_cache_data(self.cache) }
+            .map_err(vulkan("vkGetPipelineCacheData"))?;
+        if data.len() == *known {
+            return Ok(());
+        }
+        let folder = file.parent().expect("the file lies in the cache's folder");
+        let failed = |error| Error::io(file, error);
+        std::fs::create_dir_all(folder).map_err(failed)?;
+        let beside = file.with_extension(format!("{}.part", std::process::id()));
+        std::fs::write(&beside, data).map_err(failed)?;
+        std::fs::rename(&beside, file).map_err(failed)
     }
 
     fn build(
@@ -182,7 +228,7 @@ impl Pipelines {
             // SAFETY: everything that `create` names outlives the call.
             unsafe {
                 self.device
-                    .create_compute_pipelines(vk::PipelineCache::null(), &create, None)
+                    .create_compute_pipelines(self.cache, &create, None)
             }
             .map_err(|(_, error)| vulkan("vkCreateComputePipelines")(error))
         };
@@ -194,10 +240,36 @@ impl Pipelines {
     }
 }
 
+/// One file for each device and driver: what one driver compiled, another must not read.
+fn cache_name(info: &DeviceInfo) -> String {
+    let uuid: String = info
+        .cache_uuid
+        .iter()
+        .map(|byte| format!("{byte:02x}"))
+        .collect();
+    format!("pipelines-{uuid}-{:08x}.bin", info.driver_version)
+}
+
+/// Whether cached data begins with this device's header: length, version 1, vendor, device, UUID (VkPipelineCacheHeaderVersionOne).
+fn is_for(data: &[u8], info: &DeviceInfo) -> bool {
+    let word = |at: usize| {
+        data.get(at..at + 4)
+            .map(|b| u32::from_le_bytes([b[0], b[1], b[2], b[3]]))
+    };
+    word(0) == Some(32)
+        && word(4) == Some(1)
+        && word(8) == Some(info.vendor_device.0)
+        && word(12) == Some(info.vendor_device.1)
+        && data.get(16..32) == Some(info.cache_uuid.as_slice())
+}
+
 impl Drop for Pipelines {
     fn drop(&mut self) {
-        // SAFETY: the queue, dropped before, waited for all work.
+        // A cache that cannot be written only costs time at the next start.
+        let _ = self.save();
+        // SAFETY: the last owner waited for all work.
         unsafe {
+            self.device.destroy_pipeline_cache(self.cache, None);
             for (pipeline, _) in self.built.lock().expect("no panic under the lock").values() {
                 self.device.destroy_pipeline(*pipeline, None);
             }
@@ -238,5 +310,42 @@ impl Gpu {
             gpu: self.clone(),
             args: PhantomData,
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gpu::GpuOptions;
+    use crate::gpu::device::Inner;
+
+    #[test]
+    fn every_kernel_builds_in_both_variants_and_the_layer_agrees() -> Result<()> {
+        for portable in [false, true] {
+            let options = GpuOptions {
+                validation: true,
+                portable,
+                ..GpuOptions::default()
+            };
+            let gpu = Gpu::new(&options)?;
+            let Inner {
+                pipelines,
+                context,
+                info,
+                ..
+            } = &*gpu.inner;
+            for module in crate::kernels::ALL {
+                let pipeline = pipelines.build(context, info, module, &[])?;
+                // SAFETY: nothing uses it.
+                unsafe { context.device.destroy_pipeline(pipeline, None) };
+                assert_eq!(
+                    gpu.validation_messages(),
+                    Vec::<String>::new(),
+                    "{}",
+                    module.name
+                );
+            }
+        }
+        Ok(())
     }
 }

@@ -25,15 +25,26 @@
 
 mod buffer;
 mod device;
+mod hazards;
+mod instance;
 mod kernel;
+mod memory;
+mod profile;
 mod queue;
 mod recorder;
 #[cfg(test)]
 mod reflect;
+mod roofs;
 mod transfer;
+mod validation;
 
 pub use buffer::{Buffer, Ptr, PtrMut, Readback};
-pub use device::{DeviceInfo, DeviceKind, Gpu, GpuOptions};
+pub use device::{Gpu, GpuOptions};
+pub use instance::{DeviceInfo, DeviceKind};
 pub use kernel::{Kernel, KernelModule, KernelShape, PointerArg};
+pub use memory::{MemoryPlan, Overrun};
+pub use profile::{Event, Profile, ProfileRow};
 pub use queue::Ticket;
 pub use recorder::{Recorder, Work};
+pub use roofs::Roofs;
+pub use validation::ValidationLog;

@@ -1,11 +1,13 @@
 //! Submission: one compute queue, one timeline semaphore that counts submissions, two calls of `submit` in flight.
 
-use super::buffer::{Memory, Parts};
 use super::device::{Context, Gpu, vulkan};
-use super::recorder::{Hazards, Recorder};
+use super::hazards::Hazards;
+use super::memory::{Memory, Parts};
+use super::profile::Stamps;
+use super::recorder::Recorder;
 use crate::Result;
 use ash::vk;
-use std::sync::Mutex;
+use std::sync::{Mutex, MutexGuard};
 use std::thread::ThreadId;
 
 /// Work that was submitted; done when the timeline semaphore reaches its value.
@@ -37,6 +39,7 @@ pub(super) struct Slot {
     buffers: Vec<vk::CommandBuffer>,
     used: usize,
     last: u64,
+    pub(super) stamps: Stamps,
 }
 
 /// Memory whose owner is gone while the device may still use it: (value to wait for, memory).
@@ -71,6 +74,7 @@ impl Queue {
                 buffers: Vec::new(),
                 used: 0,
                 last: 0,
+                stamps: Stamps::default(),
             })
         };
         let slots = [slot()?, slot()?];
@@ -87,6 +91,18 @@ impl Queue {
             timeline,
             device: device.clone(),
         })
+    }
+
+    /// The queue's state, for the call `name`; a thread that is recording would wait for itself.
+    fn lock(&self, name: &str) -> MutexGuard<'_, QueueState> {
+        let recording = *self.recording.lock().expect("no panic under the lock");
+        assert!(
+            recording != Some(std::thread::current().id()),
+            "'{name}' inside another submit"
+        );
+        self.state
+            .lock()
+            .unwrap_or_else(|poisoned| poisoned.into_inner())
     }
 
     /// Frees memory now, or when the work that may use it is done.
@@ -162,7 +178,8 @@ impl Drop for Queue {
             .unwrap_or_else(|poisoned| poisoned.into_inner());
         // SAFETY: collect_all has waited, and nobody is left to submit.
         unsafe {
-            for slot in &state.slots {
+            for slot in &mut state.slots {
+                slot.stamps.destroy(&self.device);
                 self.device.destroy_command_pool(slot.pool, None);
             }
             self.device.destroy_semaphore(self.timeline, None);
@@ -227,16 +244,8 @@ impl Gpu {
         record: impl FnOnce(&mut Recorder) -> Result<()>,
     ) -> Result<Ticket> {
         let queue = &self.inner.queue;
-        let me = std::thread::current().id();
-        assert!(
-            *queue.recording.lock().expect("no panic under the lock") != Some(me),
-            "submit '{name}' inside another submit"
-        );
-        let mut state = queue
-            .state
-            .lock()
-            .unwrap_or_else(|poisoned| poisoned.into_inner());
-        let _recording = Recording::begin(queue, me);
+        let mut state = queue.lock(name);
+        let _recording = Recording::begin(queue);
 
         state.current = 1 - state.current;
         let current = state.current;
@@ -251,6 +260,9 @@ impl Gpu {
         }
         .map_err(vulkan("vkResetCommandPool"))?;
         slot.used = 0;
+        self.inner
+            .profiler
+            .take(self.inner.device(), &mut slot.stamps)?;
 
         queue.begin();
         let mut recorder = Recorder::new(self, &mut state, name);
@@ -268,15 +280,23 @@ impl Gpu {
 
     /// Waits until all submitted work is done.
     pub fn finish(&self) -> Result<()> {
-        let submitted = self
-            .inner
-            .queue
-            .state
-            .lock()
-            .unwrap_or_else(|poisoned| poisoned.into_inner())
-            .submitted;
+        let submitted = self.inner.queue.lock("finish").submitted;
         self.inner.queue.wait(submitted)?;
         self.inner.queue.collect(&self.inner.memory, submitted);
+        Ok(())
+    }
+
+    /// Waits for everything and reads its timestamps.
+    pub(super) fn read_stamps(&self) -> Result<()> {
+        let queue = &self.inner.queue;
+        let mut state = queue.lock("profile");
+        queue.wait(state.submitted)?;
+        let older = 1 - state.current;
+        for slot in [older, 1 - older] {
+            self.inner
+                .profiler
+                .take(self.inner.device(), &mut state.slots[slot].stamps)?;
+        }
         Ok(())
     }
 
@@ -290,7 +310,8 @@ impl Gpu {
 struct Recording<'a>(&'a Queue);
 
 impl<'a> Recording<'a> {
-    fn begin(queue: &'a Queue, thread: ThreadId) -> Self {
+    fn begin(queue: &'a Queue) -> Self {
+        let thread = std::thread::current().id();
         *queue.recording.lock().expect("no panic under the lock") = Some(thread);
         Recording(queue)
     }

@@ -4,14 +4,18 @@
 //! (min(groups, 256), ⌈groups / 256⌉, slices), since one dimension ends at 65535. Submissions are cut by estimated time, because a
 //! watchdog ends what runs for seconds; one large launch is itself cut along its rows.
 
-use super::buffer::{Buffer, Slab};
-use super::device::{DeviceKind, Gpu, vulkan};
+use super::buffer::Buffer;
+use super::device::{Gpu, vulkan};
+use super::instance::DeviceKind;
 use super::kernel::Kernel;
+use super::memory::Slab;
+use super::profile::Entry;
 use super::queue::QueueState;
 use crate::{Error, Result};
 use ash::vk;
 use bytemuck::Pod;
 use std::ops::Range;
+use std::sync::Arc;
 
 /// Seconds of estimated work after which a submission is cut.
 const SUBMISSION_SECONDS: f64 = 0.2;
@@ -86,63 +90,18 @@ impl Work {
         }
     }
 
+    /// (flops, bytes) of a part of the work, as far as the caller gave them.
+    fn given(&self, part: f64) -> (f64, f64) {
+        let scale = self.total() * part;
+        (
+            scale * self.flops.unwrap_or(0.0),
+            scale * self.bytes.unwrap_or(0.0),
+        )
+    }
+
     /// Items in all slices.
     fn total(&self) -> f64 {
         self.count() as f64 * self.slices as f64
-    }
-}
-
-/// Allocations touched since the last barrier.
-#[derive(Default)]
-pub(super) struct Hazards {
-    read: Vec<u64>,
-    written: Vec<u64>,
-    /// Something unknown was read, or written: earlier submissions, pointers found in memory.
-    read_any: bool,
-    written_any: bool,
-    /// The next command's own accesses.
-    reads: Vec<u64>,
-    writes: Vec<u64>,
-}
-
-impl Hazards {
-    /// Whether the next command must wait for what came before.
-    fn collide(&self, reads_any: bool, writes_any: bool) -> bool {
-        let read_something = self.read_any || !self.read.is_empty();
-        let wrote_something = self.written_any || !self.written.is_empty();
-        let touches = !self.reads.is_empty() || !self.writes.is_empty() || reads_any || writes_any;
-        let writes = !self.writes.is_empty() || writes_any;
-        (self.written_any && touches)
-            || (self.read_any && writes)
-            || (reads_any && wrote_something)
-            || (writes_any && (read_something || wrote_something))
-            || self.reads.iter().any(|id| self.written.contains(id))
-            || self
-                .writes
-                .iter()
-                .any(|id| self.written.contains(id) || self.read.contains(id))
-    }
-
-    fn clear(&mut self) {
-        self.read.clear();
-        self.written.clear();
-        (self.read_any, self.written_any) = (false, false);
-    }
-
-    /// The next command has been recorded.
-    fn commit(&mut self, reads_any: bool, writes_any: bool) {
-        for id in self.reads.drain(..) {
-            if !self.read.contains(&id) {
-                self.read.push(id);
-            }
-        }
-        for id in self.writes.drain(..) {
-            if !self.written.contains(&id) {
-                self.written.push(id);
-            }
-        }
-        self.read_any |= reads_any;
-        self.written_any |= writes_any;
     }
 }
 
@@ -151,6 +110,8 @@ pub struct Recorder<'a> {
     gpu: &'a Gpu,
     state: &'a mut QueueState,
     name: &'a str,
+    /// The name again, shared with the profile's events; made where there are any.
+    call: Option<Arc<str>>,
     /// The open command buffer.
     commands: Option<vk::CommandBuffer>,
     /// Estimated seconds in it.
@@ -161,14 +122,12 @@ pub struct Recorder<'a> {
 
 impl<'a> Recorder<'a> {
     pub(super) fn new(gpu: &'a Gpu, state: &'a mut QueueState, name: &'a str) -> Self {
-        // Earlier calls may have written anything.
-        state.hazards.clear();
-        state.hazards.written_any = true;
-        state.hazards.read_any = true;
+        state.hazards.start();
         Recorder {
             gpu,
             state,
             name,
+            call: gpu.inner.options.profile.then(|| name.into()),
             commands: None,
             seconds: 0.0,
             error: None,
@@ -226,7 +185,7 @@ impl<'a> Recorder<'a> {
             MAX_GROUPS.min(limit)
         );
         assert!(
-            std::sync::Arc::ptr_eq(&self.gpu.inner, &kernel.gpu.inner),
+            Arc::ptr_eq(&self.gpu.inner, &kernel.gpu.inner),
             "{}: a kernel of another device",
             kernel.row
         );
@@ -257,6 +216,9 @@ impl<'a> Recorder<'a> {
                     return;
                 };
                 let layout = self.gpu.inner.pipelines.layout;
+                let whole = (first_row, first_slice) == (0, 0);
+                let cost = work.given(part);
+                let end = self.begin_stamp(commands, &kernel.row, whole, cost);
                 let device = self.gpu.inner.device();
                 self.begin_label(commands, &kernel.row);
                 // SAFETY: an open command buffer, a pipeline made with this layout, a block within its range.
@@ -284,6 +246,7 @@ impl<'a> Recorder<'a> {
                     );
                 }
                 self.end_label(commands);
+                self.end_stamp(commands, end);
             }
         }
     }
@@ -329,6 +292,7 @@ impl<'a> Recorder<'a> {
             let Some(commands) = self.open(self.estimate(0.0, len as f64)) else {
                 return;
             };
+            let end = self.begin_stamp(commands, "(fill)", at == range.start, (0.0, len as f64));
             // SAFETY: an open command buffer; the range lies in the buffer.
             unsafe {
                 self.gpu
@@ -336,6 +300,7 @@ impl<'a> Recorder<'a> {
                     .device()
                     .cmd_fill_buffer(commands, slab.parts.raw, at, len, word)
             };
+            self.end_stamp(commands, end);
             at += len;
         }
     }
@@ -361,6 +326,7 @@ impl<'a> Recorder<'a> {
                 dst_offset: to_at + done,
                 size,
             }];
+            let end = self.begin_stamp(commands, "(copy)", done == 0, (0.0, 2.0 * size as f64));
             // SAFETY: an open command buffer; both ranges lie in their buffers.
             unsafe {
                 self.gpu
@@ -368,6 +334,7 @@ impl<'a> Recorder<'a> {
                     .device()
                     .cmd_copy_buffer(commands, from, to, &regions)
             };
+            self.end_stamp(commands, end);
             done += size;
         }
     }
@@ -492,6 +459,51 @@ impl<'a> Recorder<'a> {
         self.state.submit(self.gpu, commands)
     }
 
+    /// Writes the timestamp before a command, where the device is profiled; returns where the one behind it goes. `cost` is (flops, bytes).
+    fn begin_stamp(
+        &mut self,
+        commands: vk::CommandBuffer,
+        row: &str,
+        first: bool,
+        cost: (f64, f64),
+    ) -> Option<(vk::QueryPool, u32)> {
+        let call = self.call.clone()?;
+        let entry = Entry {
+            row: row.into(),
+            call,
+            first,
+            flops: cost.0,
+            bytes: cost.1,
+        };
+        let slot = self.state.current;
+        let begun = self.state.slots[slot]
+            .stamps
+            .begin(&self.gpu.inner.context, commands, entry);
+        begun.map_err(|error| self.error = Some(error)).ok()
+    }
+
+    fn end_stamp(&self, commands: vk::CommandBuffer, end: Option<(vk::QueryPool, u32)>) {
+        let Some((pool, query)) = end else { return };
+        // SAFETY: an open command buffer and the second query of a pair that was reset.
+        unsafe {
+            self.gpu.inner.device().cmd_write_timestamp(
+                commands,
+                vk::PipelineStageFlags::BOTTOM_OF_PIPE,
+                pool,
+                query,
+            )
+        };
+    }
+
+    /// Times nothing: for setting the clock.
+    pub(super) fn stamp_nothing(&mut self) {
+        let Some(commands) = self.open(0.0) else {
+            return;
+        };
+        let end = self.begin_stamp(commands, "(clock)", true, (0.0, 0.0));
+        self.end_stamp(commands, end);
+    }
+
     fn begin_label(&self, commands: vk::CommandBuffer, name: &str) {
         let Some(debug) = &self.gpu.inner.context.debug else {
             return;
@@ -511,5 +523,81 @@ impl<'a> Recorder<'a> {
         };
         // SAFETY: an open command buffer with an open label.
         unsafe { debug.cmd_end_debug_utils_label(commands) };
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gpu::GpuOptions;
+
+    #[test]
+    fn a_long_launch_is_cut_into_submissions_and_a_short_one_is_not() -> Result<()> {
+        use crate::kernels::fill;
+        let gpu = Gpu::new(&GpuOptions::default())?;
+        let values = gpu.buffer::<f32>("values", 64)?;
+        let kernel = gpu.kernel(fill::Shape::default())?;
+        let submissions = |seconds: f64, rows: u64, slices: u32| {
+            let items = rows * ROW * 64;
+            let before = gpu.submit("nothing", |_| Ok(()))?;
+            let after = gpu.submit("launch", |rec| {
+                // However fast the device: as many operations as are estimated to take so long.
+                let flops =
+                    seconds / rec.estimate(1e18, 0.0) * 1e18 / (items as f64 * slices as f64);
+                let args = fill::Args {
+                    values: values.ptr_mut(),
+                    n: 64,
+                    value: 1.0,
+                };
+                rec.run(
+                    &kernel,
+                    Work::items(items).slices(slices).flops(flops).bytes(0.0),
+                    args,
+                );
+                Ok(())
+            })?;
+            Ok::<u64, Error>(after.0 - before.0)
+        };
+        assert_eq!(submissions(0.1, 8, 1)?, 1);
+        assert_eq!(submissions(1.0, 10, 1)?, 5);
+        assert_eq!(submissions(1.0, 5, 2)?, 5);
+        assert_eq!(
+            submissions(100.0, 3, 2)?,
+            6,
+            "no further than one row of one slice"
+        );
+        assert_eq!(submissions(1.0, 1, 10)?, 5);
+        Ok(())
+    }
+
+    #[test]
+    fn synchronisation_checks_see_a_missing_barrier() -> Result<()> {
+        let options = GpuOptions {
+            validation: true,
+            ..GpuOptions::default()
+        };
+        let gpu = Gpu::new(&options)?;
+        let words = gpu.buffer::<u32>("words", 64)?;
+        let fill_twice = |forget: bool| {
+            gpu.submit("twice", |rec| {
+                rec.fill(&words, 0..64, 1);
+                if forget {
+                    rec.state.hazards.clear();
+                }
+                rec.fill(&words, 0..64, 2);
+                Ok(())
+            })
+        };
+        fill_twice(false)?;
+        assert_eq!(gpu.validation_messages(), Vec::<String>::new());
+        fill_twice(true)?;
+        let said = gpu.validation_messages();
+        assert!(
+            said.iter().any(
+                |text| text.contains("WRITE-AFTER-WRITE") || text.contains("WRITE_AFTER_WRITE")
+            ),
+            "{said:?}"
+        );
+        Ok(())
     }
 }

@@ -1,7 +1,8 @@
 //! Uploads and downloads, through two halves of a host buffer that take turns: one is copied by the host while the device copies the other.
 
-use super::buffer::{Buffer, Parts};
+use super::buffer::Buffer;
 use super::device::Gpu;
+use super::memory::{Parts, Slab};
 use super::queue::Ticket;
 use crate::Result;
 use bytemuck::Pod;
@@ -51,30 +52,24 @@ impl Gpu {
     pub fn download<T: Pod>(&self, buffer: &Buffer<T>, first: u64, len: u64) -> Result<Vec<T>> {
         let source = buffer.byte_range(first..first + len);
         let mut data = vec![T::zeroed(); len as usize];
-        self.download_bytes(buffer, source.start, bytemuck::cast_slice_mut(&mut data))?;
+        self.download_bytes(
+            &buffer.slab,
+            source.start,
+            bytemuck::cast_slice_mut(&mut data),
+        )?;
         Ok(data)
     }
 
-    pub(super) fn download_bytes<T>(
-        &self,
-        buffer: &Buffer<T>,
-        from: u64,
-        out: &mut [u8],
-    ) -> Result<()> {
+    /// Bytes of a buffer, padding included.
+    pub(super) fn download_bytes(&self, slab: &Slab, from: u64, out: &mut [u8]) -> Result<()> {
         self.staged(|gpu, staging| {
             let mut pending: Option<(Ticket, u64, &mut [u8])> = None;
             for (turn, chunk) in out.chunks_mut(HALF as usize).enumerate() {
                 let (at, from) = ((turn % 2) as u64 * HALF, from + turn as u64 * HALF);
                 let ticket = gpu.submit("download", |rec| {
-                    rec.note(buffer.slab.id, false);
+                    rec.note(slab.id, false);
                     rec.note(STAGING_ID, true);
-                    rec.copy_bytes(
-                        buffer.slab.parts.raw,
-                        from,
-                        staging.raw,
-                        at,
-                        chunk.len() as u64,
-                    );
+                    rec.copy_bytes(slab.parts.raw, from, staging.raw, at, chunk.len() as u64);
                     Ok(())
                 })?;
                 if let Some((ticket, at, chunk)) = pending.replace((ticket, at, chunk)) {

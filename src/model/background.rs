@@ -63,16 +63,18 @@ impl Background {
         }
     }
 
-    /// Adds the parameters and builds the kernels.
+    /// Adds the parameters and builds the kernels. `sky` is where a constant background starts: a sky that began far from its colour
+    /// would first be explained by an opaque shell around the cameras, which never goes away again.
     pub fn new(
         gpu: &Gpu,
         config: &Config,
         plan: &mut ParamsPlan,
         views: u32,
+        sky: [f32; 3],
     ) -> Result<Background> {
         Ok(match config.background.kind {
             BackgroundKind::None => Background::None,
-            BackgroundKind::Constant => Background::Constant(Constant::new(gpu, plan)?),
+            BackgroundKind::Constant => Background::Constant(Constant::new(gpu, plan, sky)?),
             BackgroundKind::Field => {
                 Background::Field(Box::new(Radiance::new(gpu, config, plan, views)?))
             }
@@ -132,13 +134,14 @@ pub struct Constant {
 }
 
 impl Constant {
-    fn new(gpu: &Gpu, plan: &mut ParamsPlan) -> Result<Constant> {
+    fn new(gpu: &Gpu, plan: &mut ParamsPlan, sky: [f32; 3]) -> Result<Constant> {
+        let logits = sky.map(|c| c.clamp(0.01, 0.99)).map(|c| (c / (1.0 - c)).ln());
         Ok(Constant {
             logits: plan.add(
                 Group::Background,
                 "background.constant",
                 &[3],
-                Init::Values(vec![0.0; 3]),
+                Init::Values(logits.to_vec()),
             ),
             forward: gpu.kernel(background_constant::Shape::default())?,
             backward: gpu.kernel(background_constant_backward::Shape::default())?,

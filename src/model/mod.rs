@@ -31,14 +31,14 @@ pub struct Model {
 }
 
 impl Model {
-    /// Builds and initialises the model of a configuration for `n_views` training views.
-    pub fn new(gpu: &Gpu, config: &Config, n_views: u32) -> Result<Model> {
+    /// Builds and initialises the model of a configuration for `n_views` training views under a sky of this colour.
+    pub fn new(gpu: &Gpu, config: &Config, n_views: u32, sky: [f32; 3]) -> Result<Model> {
         let mut plan = ParamsPlan::default();
         let surface = Surface::new(gpu, config, &mut plan, n_views + 1)?;
         let proposals = (0..2)
             .map(|level| Proposal::new(gpu, config, &mut plan, level))
             .collect::<Result<_>>()?;
-        let background = Background::new(gpu, config, &mut plan, n_views + 1)?;
+        let background = Background::new(gpu, config, &mut plan, n_views + 1, sky)?;
         Ok(Model {
             params: plan.build(gpu, config.seed)?,
             surface,

@@ -16,6 +16,8 @@ pub struct ViewTable {
     /// RGBA8, one buffer a picture, so that no allocation grows with the dataset.
     _pixels: Vec<Buffer<u32>>,
     n_training: u32,
+    /// The commonest colour along the pictures' borders: what an even sky looks like.
+    border_color: [f32; 3],
 }
 
 impl ViewTable {
@@ -28,6 +30,7 @@ impl ViewTable {
     ) -> Result<ViewTable> {
         let n_training = training.len() as u32;
         let (mut rows, mut pixels, mut counts) = (Vec::new(), Vec::new(), Vec::new());
+        let mut borders = BorderColors::default();
         for (index, view) in training.enumerate() {
             let (camera, pose, picture) = view?;
             let rgba: &[u32] = bytemuck::cast_slice(&picture.rgba);
@@ -35,6 +38,7 @@ impl ViewTable {
             gpu.upload(&buffer, 0, rgba)?;
             rows.push(view_row(region, &camera, &pose, buffer.ptr()));
             counts.push(rgba.len() as f64);
+            borders.add(&picture);
             pixels.push(buffer);
         }
         let none = pixels
@@ -62,12 +66,47 @@ impl ViewTable {
             cumulative_share,
             _pixels: pixels,
             n_training,
+            border_color: borders.commonest(),
         })
+    }
+
+    /// The commonest colour along the borders of the training pictures, in [0, 1].
+    pub fn border_color(&self) -> [f32; 3] {
+        self.border_color
     }
 
     /// Number of training views; also the row of the appearance code that evaluation uses.
     pub fn n_training(&self) -> u32 {
         self.n_training
+    }
+}
+
+/// A coarse colour histogram of picture borders.
+#[derive(Default)]
+struct BorderColors {
+    /// Count and sum of the colours by their upper four bits per channel.
+    bins: std::collections::HashMap<[u8; 3], (u64, [u64; 3])>,
+}
+
+impl BorderColors {
+    fn add(&mut self, picture: &Picture) {
+        let (w, h) = (picture.width as usize, picture.height as usize);
+        let rows = (0..w).flat_map(|x| [x, (h - 1) * w + x]);
+        let columns = (0..h).flat_map(|y| [y * w, y * w + w - 1]);
+        for pixel in rows.chain(columns) {
+            let rgb: [u8; 3] = std::array::from_fn(|c| picture.rgba[4 * pixel + c]);
+            let (count, sum) = self.bins.entry(rgb.map(|c| c >> 4)).or_default();
+            *count += 1;
+            for (sum, value) in sum.iter_mut().zip(rgb) {
+                *sum += u64::from(value);
+            }
+        }
+    }
+
+    /// Mean of the fullest bin; grey without pictures. Ties go to the darker one, so that the answer does not depend on hashing.
+    fn commonest(&self) -> [f32; 3] {
+        let fullest = self.bins.iter().max_by_key(|(bin, (count, _))| (*count, std::cmp::Reverse(**bin)));
+        fullest.map_or([0.5; 3], |(_, (count, sum))| sum.map(|s| s as f32 / (*count as f32 * 255.0)))
     }
 }
 

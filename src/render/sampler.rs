@@ -76,7 +76,11 @@ impl Sampler {
             train,
         };
         let n_edges = u64::from(n) * u64::from(args.n_samples + 1);
-        rec.run(&self.place, Work::items(n_edges).flops(10.0).bytes(8.0), args);
+        rec.run(
+            &self.place,
+            Work::items(n_edges).flops(10.0).bytes(8.0),
+            args,
+        );
         for (level, (proposal, b)) in model.proposals.iter().zip(&self.levels).enumerate() {
             let n_samples = proposal.n_samples;
             let args = midpoint_positions::Args {

@@ -243,10 +243,7 @@ fn stated_or_estimated(scene: &Scene, prefer_box: bool) -> Result<Region> {
             let all = points.iter().chain(&cameras).copied().collect();
             (
                 all,
-                format!(
-                    "the sparse points and cameras, which look outwards ({})",
-                    looks.why
-                ),
+                "the sparse points and the cameras, which look outwards".into(),
             )
         }
     };
@@ -411,11 +408,10 @@ impl Looks {
             "from the middle of the points, the median camera is {of_cameras:.3} away and the median point {of_points:.3}"
         );
         // Background can outnumber an object's points, but not turn the cameras away from it; a room's far walls lie beyond cameras.
-        let facing = if seeing >= 0.9 && of_cameras > 0.3 * of_points
+        let inward = seeing >= 0.9 && of_cameras > 0.3 * of_points
             || seeing >= 0.5 && of_cameras > of_points
-        {
-            Facing::Inward
-        } else if of_cameras > 1.5 * of_points {
+            || of_cameras > 1.5 * of_points;
+        let facing = if inward {
             Facing::Inward
         } else {
             Facing::Outward

@@ -4,19 +4,22 @@
 //! little-endian with a 64-bit count in front; counts are never believed, only what the file holds. COLMAP 4 writes rigs and frames
 //! beside them; the poses are still in images, so those are not read.
 
+mod binary;
+mod text;
+
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
 use glam::{DMat4, DQuat, DVec3};
 
-use super::camera::UNSUPPORTED_MODELS;
 use super::{Camera, CameraModel, Format, Frame, FrameLens, Point, Reading, Skipped};
 use crate::{Error, Result};
 
 /// Where a model may lie below a dataset's directory.
-const PLACES: [&str; 7] = [
+const PLACES: [&str; 8] = [
     "sparse/0",
     "sparse",
+    "0",
     "colmap/sparse/0",
     "colmap/sparse",
     "colmap/0",
@@ -270,7 +273,7 @@ impl ImageRecord {
             return Err(bad_pose(format!("its pose holds {bad}")));
         }
         let quaternion = DQuat::from_xyzw(q[1], q[2], q[3], q[0]);
-        if !(quaternion.length() > 1e-6) {
+        if quaternion.length() <= 1e-6 {
             return Err(bad_pose(format!(
                 "its rotation {q:?} is a quaternion of length 0"
             )));
@@ -292,26 +295,26 @@ fn is_binary(file: &Path) -> bool {
 
 fn read_cameras(file: &Path) -> Result<HashMap<u32, Camera>> {
     if is_binary(file) {
-        binary_cameras(file)
+        binary::cameras(file)
     } else {
-        text_cameras(file)
+        text::cameras(file)
     }
 }
 
 fn read_images(file: &Path) -> Result<Vec<ImageRecord>> {
     if is_binary(file) {
-        binary_images(file)
+        binary::images(file)
     } else {
-        text_images(file)
+        text::images(file)
     }
 }
 
 /// Points with finite positions; how many have not is noted.
 fn read_points(file: &Path, notes: &mut Vec<String>) -> Result<Vec<Point>> {
     let mut points = if is_binary(file) {
-        binary_points(file)?
+        binary::points(file)?
     } else {
-        text_points(file)?
+        text::points(file)?
     };
     let all = points.len();
     points.retain(|point| point.position.is_finite());
@@ -350,288 +353,4 @@ fn unsupported(file: &Path, id: u32, name: &str) -> Error {
         ),
         "undistort the pictures with `colmap image_undistorter`, or use one of those models",
     )
-}
-
-// Binary.
-
-/// A binary file in memory and the place that was read up to.
-struct Bytes<'a> {
-    file: &'a Path,
-    data: Vec<u8>,
-    at: usize,
-}
-
-impl<'a> Bytes<'a> {
-    fn open(file: &'a Path) -> Result<Self> {
-        let data = std::fs::read(file).map_err(|source| Error::io(file, source))?;
-        Ok(Bytes { file, data, at: 0 })
-    }
-
-    /// The next `count` bytes, which are (part of) `what`.
-    fn take(&mut self, count: u64, what: &dyn Fn() -> String) -> Result<&[u8]> {
-        let left = (self.data.len() - self.at) as u64;
-        if count > left {
-            return Err(Error::input(
-                self.file,
-                format!(
-                    "ends within {}: at byte {} it takes {count} more, but the file has {} bytes",
-                    what(),
-                    self.at,
-                    self.data.len()
-                ),
-                "the file is truncated or damaged: copy it again, or export the model again",
-            ));
-        }
-        let start = self.at;
-        self.at += count as usize;
-        Ok(&self.data[start..self.at])
-    }
-
-    fn array<const N: usize>(&mut self, what: &dyn Fn() -> String) -> Result<[u8; N]> {
-        Ok(self
-            .take(N as u64, what)?
-            .try_into()
-            .expect("N bytes were taken"))
-    }
-
-    fn u32(&mut self, what: &dyn Fn() -> String) -> Result<u32> {
-        self.array(what).map(u32::from_le_bytes)
-    }
-
-    fn u64(&mut self, what: &dyn Fn() -> String) -> Result<u64> {
-        self.array(what).map(u64::from_le_bytes)
-    }
-
-    fn f64s<const N: usize>(&mut self, what: &dyn Fn() -> String) -> Result<[f64; N]> {
-        let mut values = [0.0; N];
-        for value in &mut values {
-            *value = f64::from_le_bytes(self.array(what)?);
-        }
-        Ok(values)
-    }
-
-    /// A count in front of records of at least `smallest` bytes: what the file cannot hold is refused before anything is allocated.
-    fn count(&mut self, smallest: u64, records: &str) -> Result<usize> {
-        let count = self.u64(&|| format!("the number of {records}"))?;
-        let left = (self.data.len() - self.at) as u64;
-        if count > left / smallest {
-            return Err(Error::input(
-                self.file,
-                format!(
-                    "says that {count} {records} follow byte {}, each of {smallest} bytes or more, but the file has {} bytes",
-                    self.at,
-                    self.data.len()
-                ),
-                "the file is truncated or damaged: copy it again, or export the model again",
-            ));
-        }
-        Ok(count as usize)
-    }
-}
-
-fn binary_cameras(file: &Path) -> Result<HashMap<u32, Camera>> {
-    let mut bytes = Bytes::open(file)?;
-    let count = bytes.count(48, "cameras")?;
-    let mut cameras = HashMap::with_capacity(count);
-    for number in 1..=count {
-        let what = || format!("camera {number} of {count}");
-        let (id, model_id) = (bytes.u32(&what)?, bytes.u32(&what)?);
-        let Some(model) = CameraModel::from_id(model_id) else {
-            // The model says how many parameters follow: behind an unknown one nothing can be read.
-            let name = UNSUPPORTED_MODELS
-                .into_iter()
-                .find(|(known, _)| *known == model_id);
-            return Err(match name {
-                Some((_, name)) => unsupported(file, id, &format!("{name} (number {model_id})")),
-                None => unsupported(file, id, &format!("number {model_id}, unknown to COLMAP 4")),
-            });
-        };
-        let size = (bytes.u64(&what)?, bytes.u64(&what)?);
-        let mut params = vec![0.0; model.param_count()];
-        for param in &mut params {
-            [*param] = bytes.f64s(&what)?;
-        }
-        cameras.insert(id, camera_from(file, id, model, size, params)?);
-    }
-    Ok(cameras)
-}
-
-fn binary_images(file: &Path) -> Result<Vec<ImageRecord>> {
-    let mut bytes = Bytes::open(file)?;
-    let count = bytes.count(73, "images")?;
-    let mut images = Vec::with_capacity(count);
-    for number in 1..=count {
-        let what = || format!("image {number} of {count}");
-        bytes.u32(&what)?; // COLMAP's number for it
-        let (q, t) = (bytes.f64s::<4>(&what)?, bytes.f64s::<3>(&what)?);
-        let camera_id = bytes.u32(&what)?;
-        let rest = &bytes.data[bytes.at..];
-        let length = rest
-            .iter()
-            .position(|byte| *byte == 0)
-            .unwrap_or(rest.len());
-        let name = bytes.take(length as u64 + 1, &|| {
-            format!("the name of image {number} of {count}")
-        })?;
-        let name = String::from_utf8_lossy(&name[..length]).into_owned();
-        let observations = bytes.count(24, "observed points of an image")?;
-        bytes.take(observations as u64 * 24, &what)?;
-        images.push(ImageRecord::new(file, name, camera_id, q, t)?);
-    }
-    Ok(images)
-}
-
-fn binary_points(file: &Path) -> Result<Vec<Point>> {
-    let mut bytes = Bytes::open(file)?;
-    let count = bytes.count(51, "points")?;
-    let mut points = Vec::with_capacity(count);
-    for number in 1..=count {
-        let what = || format!("point {number} of {count}");
-        bytes.u64(&what)?;
-        let position = DVec3::from(bytes.f64s::<3>(&what)?);
-        let color = bytes.array(&what)?;
-        bytes.f64s::<1>(&what)?; // reprojection error
-        let track = bytes.count(8, "observations of a point")?;
-        bytes.take(track as u64 * 8, &what)?;
-        points.push(Point { position, color });
-    }
-    Ok(points)
-}
-
-// Text.
-
-/// A text file's lines, with what is needed to say which of them is wrong.
-struct Lines<'a> {
-    file: &'a Path,
-    text: String,
-}
-
-/// One line's words.
-struct Words<'a> {
-    file: &'a Path,
-    line: usize,
-    rest: &'a str,
-}
-
-impl<'a> Lines<'a> {
-    fn open(file: &'a Path) -> Result<Self> {
-        let data = std::fs::read(file).map_err(|source| Error::io(file, source))?;
-        let text = String::from_utf8_lossy(&data).into_owned();
-        Ok(Lines { file, text })
-    }
-
-    /// All lines with their numbers from 1.
-    fn all(&self) -> impl Iterator<Item = Words<'_>> {
-        self.text.lines().enumerate().map(|(index, line)| Words {
-            file: self.file,
-            line: index + 1,
-            rest: line.trim(),
-        })
-    }
-}
-
-impl<'a> Words<'a> {
-    fn is_comment_or_empty(&self) -> bool {
-        self.rest.is_empty() || self.rest.starts_with('#')
-    }
-
-    fn error(&self, what: impl std::fmt::Display) -> Error {
-        Error::input(
-            self.file,
-            format!("line {}: {what}", self.line),
-            "the file is truncated or damaged: copy it again, or export the model again",
-        )
-    }
-
-    fn word(&mut self, name: &str) -> Result<&'a str> {
-        let word = self.rest.split_whitespace().next();
-        let Some(word) = word else {
-            return Err(self.error(format!("ends before {name}")));
-        };
-        self.rest = self.rest[word.len()..].trim_start();
-        Ok(word)
-    }
-
-    fn number<T: std::str::FromStr>(&mut self, name: &str) -> Result<T> {
-        let word = self.word(name)?;
-        word.parse()
-            .map_err(|_| self.error(format!("{word:?} cannot be {name}")))
-    }
-
-    fn numbers<const N: usize>(&mut self, name: &str) -> Result<[f64; N]> {
-        let mut values = [0.0; N];
-        for value in &mut values {
-            *value = self.number(name)?;
-        }
-        Ok(values)
-    }
-}
-
-fn text_cameras(file: &Path) -> Result<HashMap<u32, Camera>> {
-    let lines = Lines::open(file)?;
-    let mut cameras = HashMap::new();
-    for mut words in lines.all().filter(|words| !words.is_comment_or_empty()) {
-        let id = words.number("a camera's number")?;
-        let name = words.word("a camera model")?;
-        let Some(model) = CameraModel::from_name(name) else {
-            return Err(unsupported(file, id, name));
-        };
-        let size = (words.number("the width")?, words.number("the height")?);
-        let mut params = Vec::new();
-        while !words.rest.is_empty() {
-            params.push(words.number("a camera parameter")?);
-        }
-        cameras.insert(id, camera_from(file, id, model, size, params)?);
-    }
-    Ok(cameras)
-}
-
-fn text_images(file: &Path) -> Result<Vec<ImageRecord>> {
-    let lines = Lines::open(file)?;
-    let mut images = Vec::new();
-    let mut lines = lines.all();
-    while let Some(mut words) = lines.next() {
-        if words.is_comment_or_empty() {
-            continue;
-        }
-        words.number::<u32>("an image's number")?;
-        let q = words.numbers::<4>("an entry of the quaternion")?;
-        let t = words.numbers::<3>("an entry of the translation")?;
-        let camera_id = words.number("the camera's number")?;
-        if words.rest.is_empty() {
-            return Err(words.error("ends before the picture's name"));
-        }
-        images.push(ImageRecord::new(
-            file,
-            words.rest.to_owned(),
-            camera_id,
-            q,
-            t,
-        )?);
-        // The second line, which may be empty, holds (x, y, point) for every feature.
-        if let Some(observed) = lines.next() {
-            let count = observed.rest.split_whitespace().count();
-            if count % 3 != 0 {
-                return Err(observed.error(format!(
-                    "{count} numbers are no list of x, y, point (an image takes two lines, the second may be empty)"
-                )));
-            }
-        }
-    }
-    Ok(images)
-}
-
-fn text_points(file: &Path) -> Result<Vec<Point>> {
-    let lines = Lines::open(file)?;
-    let mut points = Vec::new();
-    for mut words in lines.all().filter(|words| !words.is_comment_or_empty()) {
-        words.number::<u64>("a point's number")?;
-        let position = DVec3::from(words.numbers::<3>("a coordinate")?);
-        let mut color = [0; 3];
-        for channel in &mut color {
-            *channel = words.number("a colour from 0 to 255")?;
-        }
-        points.push(Point { position, color });
-    }
-    Ok(points)
 }

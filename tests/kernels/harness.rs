@@ -1,19 +1,23 @@
 //! A device under the validation layer and with guard words, arrays to and from it, and how results are compared.
+//!
+//! Give `Device::run` its input buffers as temporaries inside the arguments: they live until the launch has finished.
 
 // Shared with the float64 twin's own tests, which use more of it.
 #[allow(dead_code)]
 #[path = "../reference/npz.rs"]
 mod npz;
 
+use bytemuck::Pod;
 use neurodin::gpu::{Buffer, Gpu, GpuOptions, KernelShape, Work};
 use std::path::PathBuf;
-use std::sync::OnceLock;
+use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError};
 
 pub use npz::Npz;
 
 /// The device of all tests of this program.
 pub struct Device {
     pub gpu: Gpu,
+    turn: Mutex<()>,
 }
 
 /// Opens the device on first use. There is no point in running these tests without one, so its absence is a failure.
@@ -31,59 +35,65 @@ pub fn device() -> &'static Device {
             gpu.info().name,
             gpu.info().driver
         );
-        Device { gpu }
+        Device {
+            gpu,
+            turn: Mutex::new(()),
+        }
     })
 }
 
 impl Device {
-    /// Numbers on the device, rounded to float32. Round them in the test too ([`rounded`]) before a twin sees them.
-    pub fn put(&self, name: &str, values: &[f64]) -> Buffer<f32> {
-        let values: Vec<f32> = values.iter().map(|&x| x as f32).collect();
-        let buffer = self
-            .gpu
-            .buffer(name, values.len() as u64)
-            .expect("a small buffer");
-        self.gpu.upload(&buffer, 0, &values).expect("upload");
-        buffer
+    /// Buffers are made and kernels run one at a time: guard words are looked at only when every buffer has its own.
+    fn turn(&self) -> MutexGuard<'_, ()> {
+        self.turn.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    pub fn put_uints(&self, name: &str, values: &[u32]) -> Buffer<u32> {
-        let buffer = self
-            .gpu
-            .buffer(name, values.len() as u64)
-            .expect("a small buffer");
+    /// Elements of any kind on the device.
+    pub fn table<T: Pod>(&self, name: &str, values: &[T]) -> Buffer<T> {
+        let _turn = self.turn();
+        let buffer = self.gpu.buffer(name, values.len() as u64);
+        let buffer = buffer.expect("a small buffer");
         self.gpu.upload(&buffer, 0, values).expect("upload");
         buffer
     }
 
+    /// Numbers on the device, rounded to float32. Round them in the test too ([`rounded`]) before a twin sees them.
+    pub fn put(&self, name: &str, values: &[f64]) -> Buffer<f32> {
+        let values: Vec<f32> = values.iter().map(|&x| x as f32).collect();
+        self.table(name, &values)
+    }
+
     /// Room for results: poisoned, so that what a kernel leaves out is seen.
-    pub fn room(&self, name: &str, len: usize) -> Buffer<f32> {
+    pub fn room<T: Pod>(&self, name: &str, len: usize) -> Buffer<T> {
+        let _turn = self.turn();
         self.gpu.scratch(name, len as u64).expect("a small buffer")
     }
 
-    pub fn room_uints(&self, name: &str, len: usize) -> Buffer<u32> {
-        self.gpu.scratch(name, len as u64).expect("a small buffer")
-    }
-
-    /// Runs one kernel over `items` invocations and waits for it; guard words and the validation layer are looked at afterwards.
+    /// Runs one kernel over `items` invocations, waits for it, and looks at the guard words and at what the validation layer says.
     pub fn run<S: KernelShape>(&self, shape: S, items: usize, args: S::Args) {
+        let _turn = self.turn();
         let kernel = self.gpu.kernel(shape).expect("the kernel can be built");
         let ticket = self.gpu.submit("test", |rec| {
             rec.run(&kernel, Work::items(items as u64), args);
             Ok(())
         });
         self.gpu.wait(ticket.expect("submitted")).expect("finished");
+        let overruns = self.gpu.check_guards().expect("guard words can be read");
+        assert!(overruns.is_empty(), "written past an end: {overruns:?}");
+        let messages = self.gpu.validation_messages();
+        assert!(
+            messages.is_empty(),
+            "the validation layer objects: {messages:?}"
+        );
     }
 
+    /// Results as the twins have them.
     pub fn take(&self, buffer: &Buffer<f32>) -> Vec<f64> {
-        let values = self
-            .gpu
-            .download(buffer, 0, buffer.len())
-            .expect("download");
-        values.into_iter().map(f64::from).collect()
+        self.read(buffer).into_iter().map(f64::from).collect()
     }
 
-    pub fn take_uints(&self, buffer: &Buffer<u32>) -> Vec<u32> {
+    /// Results of any kind.
+    pub fn read<T: Pod>(&self, buffer: &Buffer<T>) -> Vec<T> {
         self.gpu
             .download(buffer, 0, buffer.len())
             .expect("download")
@@ -250,4 +260,20 @@ pub fn uneven_edges(random: &mut Random, n: usize) -> Vec<f64> {
         Some(sum.min(1.0))
     }));
     rounded(edges)
+}
+
+/// Near and far of `n` rays: both sides of the warp's bend at 1, across it, and short.
+pub fn near_far(random: &mut Random, n: usize) -> Vec<[f64; 2]> {
+    let ray = |r: &mut Random, i: usize| match i % 4 {
+        0 => [0.0, r.uniform(0.5, 0.9)],
+        1 => [r.uniform(1.1, 3.0), r.uniform(3.1, 5.0)],
+        2 => [r.uniform(0.2, 0.8), r.uniform(1.2, 2.5)],
+        _ => [1.0, r.uniform(1.1, 1.2)],
+    };
+    (0..n).map(|i| ray(random, i)).collect()
+}
+
+/// Rows one after another.
+pub fn flat<'a>(rows: impl IntoIterator<Item = &'a Vec<f64>>) -> Vec<f64> {
+    rows.into_iter().flatten().copied().collect()
 }

@@ -1,7 +1,9 @@
 //! Every kernel against a slow twin in float64, and against arrays of the published implementation.
 
 mod harness;
-mod volume;
+mod volume_compositing;
 mod volume_golden;
+mod volume_losses;
 mod volume_rays;
+mod volume_sampling;
 mod volume_twin;

@@ -85,7 +85,7 @@ impl Picture {
         Picture {
             camera,
             region_from_camera,
-            pixels: device().put_uints("pixels", &rgba),
+            pixels: device().table("pixels", &rgba),
             rgba,
         }
     }
@@ -221,8 +221,8 @@ impl Rays {
             origins: device.room("origins", 3 * n),
             directions: device.room("directions", 3 * n),
             near_far: device.room("near_far", 2 * n),
-            view: device.room_uints("ray_view", n),
-            outside: device.room_uints("ray_outside", n),
+            view: device.room("ray_view", n),
+            outside: device.room("ray_outside", n),
             target: device.room("target", 4 * n),
         }
     }
@@ -267,7 +267,7 @@ impl Rays {
             "some rays meet the region, some do not"
         );
         let outside: Vec<u32> = want.iter().map(|ray| u32::from(ray.2)).collect();
-        assert_eq!(device.take_uints(&self.outside), outside);
+        assert_eq!(device.read(&self.outside), outside);
         let near_far = interleaved::<2>(&device.take(&self.near_far));
         for (got, want) in near_far.iter().zip(&want) {
             // Near a grazing ray the ends of the chord move without bound for a given error; its middle and squared length do not.
@@ -295,11 +295,7 @@ fn training_rays() {
     let mut random = Random(11);
     let pictures = pictures(&mut random);
     let views: Vec<View> = pictures.iter().map(Picture::view).collect();
-    let table = device
-        .gpu
-        .buffer("views", views.len() as u64)
-        .expect("a small buffer");
-    device.gpu.upload(&table, 0, &views).expect("upload");
+    let table = device.table("views", &views);
     let total: usize = pictures.iter().map(|picture| picture.rgba.len()).sum();
     let share = |sum: &mut usize, picture: &Picture| {
         *sum += picture.rgba.len();
@@ -352,7 +348,7 @@ fn training_rays() {
             },
         );
         assert_eq!(
-            device.take_uints(&rays.view),
+            device.read(&rays.view),
             pixels
                 .iter()
                 .map(|pixel| pixel.0 as u32)
@@ -382,11 +378,7 @@ fn rays_of_a_view() {
     let mut random = Random(12);
     let pictures = pictures(&mut random);
     let views: Vec<View> = pictures.iter().map(Picture::view).collect();
-    let table = device
-        .gpu
-        .buffer("views", views.len() as u64)
-        .expect("a small buffer");
-    device.gpu.upload(&table, 0, &views).expect("upload");
+    let table = device.table("views", &views);
     let view = (0..views.len())
         .find(|&v| views[v].width == 16)
         .expect("one of them");
@@ -422,7 +414,7 @@ fn rays_of_a_view() {
                 half_extents: half.map(|x| x as f32),
             },
         );
-        assert_eq!(device.take_uints(&rays.view), vec![5; n as usize]);
+        assert_eq!(device.read(&rays.view), vec![5; n as usize]);
         if with_target == 0 {
             assert!(
                 device.take(&rays.target).iter().all(|x| x.is_nan()),
@@ -448,11 +440,7 @@ pub fn near_far_of(
     };
     let pictures: Vec<_> = origins.iter().zip(directions).map(picture).collect();
     let views: Vec<View> = pictures.iter().map(Picture::view).collect();
-    let table = device
-        .gpu
-        .buffer("views", n as u64)
-        .expect("a small buffer");
-    device.gpu.upload(&table, 0, &views).expect("upload");
+    let table = device.table("views", &views);
     let shares: Vec<f64> = (1..=n).map(|i| i as f64 / n as f64).collect();
     let draws: Vec<f64> = (0..3 * n)
         .map(|i| ((i % n) as f64 + 0.5) / n as f64)
@@ -478,14 +466,11 @@ pub fn near_far_of(
             half_extents: [1.0; 3],
         },
     );
-    assert_eq!(
-        device.take_uints(&rays.view),
-        (0..n as u32).collect::<Vec<_>>()
-    );
+    assert_eq!(device.read(&rays.view), (0..n as u32).collect::<Vec<_>>());
     let near_far = device.take(&rays.near_far);
     (
         near_far[..n].to_vec(),
         near_far[n..].to_vec(),
-        device.take_uints(&rays.outside),
+        device.read(&rays.outside),
     )
 }

@@ -1,11 +1,11 @@
 //! The golden vectors (arrays computed with the authors' own code): where they are, and their whole training step as a [`Step`].
 
 use super::background::Background;
+use super::batch::{Draws, Now, Rays, Step, StepConfig};
 use super::hash_grid::Grid;
 use super::losses::BiasReduction;
 use super::npz::Npz;
 use super::sampling::Region;
-use super::step::{Draws, Now, Rays, Step, StepConfig};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 

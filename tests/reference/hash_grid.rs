@@ -186,10 +186,10 @@ impl Grid {
         let mut jacobian = vec![[0.0; 3]; self.width()];
         self.visit(u, |level, corner, first, cell| {
             for feature in 0..self.features {
-                for axis in 0..3 {
-                    jacobian[level * self.features + feature][axis] +=
-                        cell.slope[corner][axis] * table[first + feature];
-                }
+                let row = &mut jacobian[level * self.features + feature];
+                *row = std::array::from_fn(|axis| {
+                    row[axis] + cell.slope[corner][axis] * table[first + feature]
+                });
             }
         });
         jacobian

@@ -143,9 +143,9 @@ pub fn bias(
         .sum();
     tape.record(1, 1, vec![value], &[f], move |tape, d_loss, gradients| {
         let Some(d_f) = gradients.of(f) else { return };
-        for ray in 0..n {
+        for (ray, d_f) in d_f[..n].iter_mut().enumerate() {
             if hinge(tape.value(f), ray) > 0.0 {
-                d_f[ray] += d_loss[0] * share(ray);
+                *d_f += d_loss[0] * share(ray);
             }
         }
     })

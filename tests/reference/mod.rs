@@ -9,6 +9,7 @@
 #![allow(dead_code)]
 
 pub mod background;
+pub mod batch;
 pub mod golden;
 pub mod hash_grid;
 pub mod losses;
@@ -21,4 +22,5 @@ pub mod schedule;
 pub mod step;
 pub mod surface;
 pub mod tape;
+pub mod trial;
 pub mod volume;

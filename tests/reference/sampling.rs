@@ -43,8 +43,33 @@ pub fn collide_sphere(origin: [f64; 3], direction: [f64; 3]) -> Stretch {
     if q < 0.0 {
         return MISSED;
     }
-    let (near, far) = ((-b - q.sqrt()).max(0.0), (-b + q.sqrt()).max(0.0));
-    if far > 0.0 {
+    stretch((-b - q.sqrt()).max(0.0), (-b + q.sqrt()).max(0.0))
+}
+
+/// Slab test (Kay & Kajiya 1986); near ≥ 0. The published collider divides by d + 1e-6 instead of guarding against d = 0.
+pub fn collide_box(half: [f64; 3], origin: [f64; 3], direction: [f64; 3]) -> Stretch {
+    let (mut near, mut far) = (0.0_f64, f64::INFINITY);
+    for axis in 0..3 {
+        let d = if direction[axis].abs() < 1e-9 {
+            1e-9
+        } else {
+            direction[axis]
+        };
+        let (a, b) = (
+            (-half[axis] - origin[axis]) / d,
+            (half[axis] - origin[axis]) / d,
+        );
+        near = near.max(a.min(b));
+        far = far.min(a.max(b));
+    }
+    stretch(near, far)
+}
+
+/// A stretch shorter than this is none.
+const SHORTEST: f64 = 1e-6;
+
+fn stretch(near: f64, far: f64) -> Stretch {
+    if far - near > SHORTEST {
         Stretch {
             near,
             far,
@@ -52,28 +77,6 @@ pub fn collide_sphere(origin: [f64; 3], direction: [f64; 3]) -> Stretch {
         }
     } else {
         MISSED
-    }
-}
-
-/// Slab test with 1/(d + 1e-6); near ≥ 0, far ≥ near + 1e-6.
-pub fn collide_box(half: [f64; 3], origin: [f64; 3], direction: [f64; 3]) -> Stretch {
-    let (mut near, mut far) = (f64::NEG_INFINITY, f64::INFINITY);
-    for axis in 0..3 {
-        let inverse = 1.0 / (direction[axis] + 1e-6);
-        let a = (-half[axis] - origin[axis]) * inverse;
-        let b = (half[axis] - origin[axis]) * inverse;
-        near = near.max(a.min(b));
-        far = far.min(a.max(b));
-    }
-    let near = near.max(0.0);
-    if far <= near {
-        MISSED
-    } else {
-        Stretch {
-            near,
-            far: far.max(near + 1e-6),
-            outside: false,
-        }
     }
 }
 

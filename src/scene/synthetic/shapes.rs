@@ -251,7 +251,7 @@ pub const fn stick_axis(index: usize) -> (DVec3, DVec3, f64) {
         [0.9272, -0.3746],
     ];
     let [x, y] = AROUND[index];
-    let lean = if index % 2 == 0 { 0.88 } else { 1.06 };
+    let lean = if index.is_multiple_of(2) { 0.88 } else { 1.06 };
     let part = index as f64 / (STICKS - 1) as f64;
     let height = 0.60 - 0.24 * part;
     (
@@ -348,15 +348,14 @@ mod tests {
     fn every_part_is_a_distance_bound() {
         // A function with slope at most 1 that is zero on the surface cannot exceed the distance to it.
         for (index, part) in PARTS.iter().enumerate() {
-            let mut near = 0;
-            for (p, towards) in points(200_000).zip(points(200_001).skip(1)) {
+            let pairs = points(200_000).zip(points(200_001).skip(1));
+            for (near, (p, towards)) in pairs.enumerate() {
                 // Half of the points are pulled close to the part, where its details decide.
                 let p = if near % 2 == 0 {
                     p
                 } else {
                     p.clamp(part.low, part.high)
                 };
-                near += 1;
                 let q = p + 1e-3 * (towards - p).normalize();
                 let (a, b) = (part.sdf(p), part.sdf(q));
                 assert!(

@@ -1,0 +1,87 @@
+//! What the device can do at most, measured: the two roofs that a profile's rows are compared with (Williams et al. 2009).
+
+use super::device::Gpu;
+use super::instance::DeviceKind;
+use super::recorder::Work;
+use crate::Result;
+use crate::kernels::{roof_copy, roof_fma};
+use std::time::Instant;
+
+/// Fastest copy and fastest arithmetic of the device.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Roofs {
+    /// Memory read and written by a copy, in 10⁹ bytes per second.
+    pub copy_gb_s: f64,
+    /// Float32 multiply-adds in registers, in 10⁹ operations per second (a multiply-add counts two).
+    pub fma_gflop_s: f64,
+}
+
+/// Seconds that one timed submission takes at least, so that submitting does not count.
+const LONG_ENOUGH: f64 = 0.05;
+/// Timed submissions, of which the fastest counts.
+const REPEATS: usize = 3;
+
+impl Gpu {
+    /// Measures both roofs, in about a second. The device should have nothing else to do.
+    pub fn measure_roofs(&self) -> Result<Roofs> {
+        let (copied, launched) = match self.info().kind {
+            DeviceKind::Cpu | DeviceKind::Other => (64u64 << 20, 1u64 << 14),
+            _ => (512 << 20, 1 << 20),
+        };
+        let n = copied / 16;
+        let (from, to) = (
+            self.buffer::<[u32; 4]>("roof from", n)?,
+            self.buffer::<[u32; 4]>("roof to", n)?,
+        );
+        let copy = self.kernel(roof_copy::Shape::default())?;
+        let copy_seconds = self.fastest(|rec| {
+            let args = roof_copy::Args {
+                from: from.ptr(),
+                to: to.ptr_mut(),
+                n: n as u32,
+            };
+            rec.run(&copy, Work::items(n).bytes(32.0), args);
+        })?;
+
+        let sums = self.buffer::<f32>("roof sums", launched)?; // [launched]
+        let shape = roof_fma::Shape::default();
+        let flops = 2.0 * 16.0 * 16.0 * shape.rounds as f64;
+        let fma = self.kernel(shape)?;
+        let fma_seconds = self.fastest(|rec| {
+            let args = roof_fma::Args {
+                sums: sums.ptr_mut(),
+                n: launched as u32,
+                gain: 0.999,
+                offset: 0.001,
+            };
+            rec.run(&fma, Work::items(launched).flops(flops), args);
+        })?;
+        Ok(Roofs {
+            copy_gb_s: 2.0 * copied as f64 / copy_seconds * 1e-9,
+            fma_gflop_s: flops * launched as f64 / fma_seconds * 1e-9,
+        })
+    }
+
+    /// Seconds of one launch, from as many at once as take long enough to be timed on the host.
+    fn fastest(&self, mut launch: impl FnMut(&mut super::Recorder)) -> Result<f64> {
+        let mut time = |launches: u32| {
+            let start = Instant::now();
+            let ticket = self.submit("roofs", |rec| {
+                (0..launches).for_each(|_| launch(rec));
+                Ok(())
+            })?;
+            self.wait(ticket)?;
+            Ok::<f64, crate::Error>(start.elapsed().as_secs_f64())
+        };
+        time(1)?; // drivers compile at the first launch
+        let mut launches = 1;
+        while time(launches)? < LONG_ENOUGH && launches < 1 << 16 {
+            launches *= 2;
+        }
+        let mut best = f64::INFINITY;
+        for _ in 0..REPEATS {
+            best = best.min(time(launches)? / launches as f64);
+        }
+        Ok(best)
+    }
+}

@@ -1,0 +1,380 @@
+//! One rig of cameras in every layout gives the same rays; and the many ways in which layouts are bent in practice.
+
+use std::fs;
+
+use glam::{DMat4, DVec2, DVec3};
+use neurodin::scene::{CameraModel, Format, Scene, SceneOptions, Split};
+use serde_json::json;
+
+use crate::fixtures::{Dataset, Rig, all_views, assert_rays};
+
+#[test]
+fn colmap_text_and_binary_give_the_rays() {
+    for binary in [false, true] {
+        let (rig, dataset) = (Rig::skewed(6), Dataset::new());
+        rig.write_pictures(&dataset.at("images"));
+        let write = if binary {
+            Rig::write_colmap_binary
+        } else {
+            Rig::write_colmap_text
+        };
+        write(&rig, &dataset.at("sparse/0"));
+        let scene = dataset.open().unwrap();
+        assert_eq!(scene.format, Format::Colmap);
+        assert_rays(&rig, &scene);
+        assert_eq!(scene.points.len(), rig.points.len());
+        assert!((scene.points[5].position - rig.points[5]).length() < 1e-12);
+        assert_eq!(scene.points[5].color, [10, 20, 30]);
+        let names: Vec<_> = scene.views.iter().map(|view| view.name.clone()).collect();
+        assert!(names.is_sorted(), "{names:?}");
+    }
+}
+
+#[test]
+fn transforms_dialects_give_the_rays() {
+    let rig = Rig::skewed(6);
+    let cases = [
+        (
+            Format::Nerfstudio,
+            json!({"camera_model": "OPENCV", "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0}),
+        ),
+        (
+            Format::InstantNgp,
+            json!({"aabb_scale": 16, "scale": 0.5, "offset": [0.5, 0.5, 0.5]}),
+        ),
+        (
+            Format::Neuralangelo,
+            json!({"sphere_center": [1.0, 2.0, 0.5], "sphere_radius": 1.5, "sk_x": 0.0, "sk_y": 0.0,
+                   "aabb_range": [[0.0, 2.0], [1.0, 3.0], [-0.5, 1.5]], "aabb_scale": 1.0}),
+        ),
+    ];
+    for (format, extra) in cases {
+        let scene = rig.dataset(&rig.transforms(extra)).open().unwrap();
+        assert_eq!(scene.format, format);
+        assert_rays(&rig, &scene);
+    }
+}
+
+#[test]
+fn blender_sets_give_the_rays() {
+    let (rig, dataset) = (Rig::around_a_ball(8), Dataset::new());
+    let angle = 2.0 * (0.5 * f64::from(rig.width) / rig.focal.x).atan();
+    for (split, views) in [("train", 0..5), ("val", 5..6), ("test", 6..8)] {
+        let mut part = rig.clone();
+        part.views = rig.views[views].to_vec();
+        part.write_pictures(&dataset.at(split));
+        let frames = part.frames(|name| format!("./{split}/{name}"));
+        let document = json!({"camera_angle_x": angle, "frames": frames});
+        dataset.write(&format!("transforms_{split}.json"), document.to_string());
+    }
+    // The validation pictures are not those of the held-out split: what is left is 5 + 2.
+    let scene = dataset.open().unwrap();
+    assert_eq!(scene.format, Format::Blender);
+    assert_eq!(
+        (
+            scene.split(Split::Train).count(),
+            scene.split(Split::Test).count()
+        ),
+        (5, 2)
+    );
+    assert!(
+        scene
+            .skipped
+            .iter()
+            .any(|skipped| skipped.what.ends_with("transforms_val.json"))
+    );
+    let mut read = rig.clone();
+    read.views.remove(5);
+    assert_rays(&read, &scene);
+}
+
+#[test]
+fn a_colmap_model_is_found_wherever_it_lies() {
+    let rig = Rig::skewed(4);
+    for (model, images, opened) in [
+        ("sparse/0", "images", ""),
+        ("sparse", "images", ""),
+        ("colmap/sparse/0", "images", ""),
+        ("", "images", ""),
+        ("", "", ""),
+        ("sparse/0", "input", ""),
+        ("sparse/0", "images", "sparse/0"),
+        ("sparse/0", "images", "sparse"),
+        ("colmap/sparse/0", "images", "colmap/sparse/0"),
+    ] {
+        let dataset = Dataset::new();
+        rig.write_pictures(&dataset.at(images));
+        rig.write_colmap_binary(&dataset.at(model));
+        // COLMAP 4 writes these beside; they are not read.
+        for name in ["rigs.bin", "frames.bin"] {
+            fs::write(dataset.at(model).join(name), [1, 2, 3]).unwrap();
+        }
+        let scene = Scene::open(&dataset.at(opened), &all_views()).unwrap();
+        assert_rays(&rig, &scene);
+    }
+}
+
+#[test]
+fn names_of_colmap_images_may_have_folders_and_spaces() {
+    for binary in [false, true] {
+        let (mut rig, dataset) = (Rig::skewed(4), Dataset::new());
+        for (index, (name, _)) in rig.views.iter_mut().enumerate() {
+            *name = format!("left side/pic {index}");
+        }
+        fs::create_dir_all(dataset.at("images/left side")).unwrap();
+        rig.write_pictures(&dataset.at("images"));
+        let write = if binary {
+            Rig::write_colmap_binary
+        } else {
+            Rig::write_colmap_text
+        };
+        write(&rig, &dataset.at("sparse/0"));
+        assert_rays(&rig, &dataset.open().unwrap());
+    }
+}
+
+#[test]
+fn other_models_of_the_same_pictures_are_named() {
+    let (rig, dataset) = (Rig::skewed(4), Dataset::new());
+    rig.write_pictures(&dataset.at("images"));
+    rig.write_colmap_binary(&dataset.at("sparse/0"));
+    rig.write_colmap_binary(&dataset.at("sparse/1"));
+    let skipped = dataset.open().unwrap().skipped;
+    assert_eq!(skipped.len(), 1);
+    assert!(skipped[0].what.ends_with("sparse/1"), "{skipped:?}");
+}
+
+#[test]
+fn paths_are_found_as_people_write_them() {
+    let rig = Rig::skewed(3);
+    let forms: [fn(&str) -> String; 6] = [
+        |name| format!("./images/{name}.png"),
+        |name| format!("images/{name}"),
+        |name| format!("images\\{name}.png"),
+        |name| format!("C:\\Users\\me\\scan\\images\\{name}.png"),
+        |name| format!("/somewhere/else/{name}.jpg"),
+        |name| format!("{name}.JPG"),
+    ];
+    for form in forms {
+        let mut transforms = rig.transforms(json!({}));
+        transforms["frames"] = rig.frames(form).into();
+        assert_rays(&rig, &rig.dataset(&transforms).open().unwrap());
+    }
+}
+
+#[test]
+fn intrinsics_may_stand_in_each_frame() {
+    let rig = Rig::skewed(3);
+    let mut frames = rig.frames(|name| format!("images/{name}.png"));
+    for frame in &mut frames {
+        frame.as_object_mut().unwrap().extend(rig.intrinsics());
+    }
+    // What the file says at its top is for other pictures.
+    let transforms =
+        json!({"fl_x": 1.0, "fl_y": 1.0, "cx": 0.0, "cy": 0.0, "w": 2, "h": 2, "frames": frames});
+    assert_rays(&rig, &rig.dataset(&transforms).open().unwrap());
+
+    let matrix = json!([
+        [rig.focal.x, 0.0, rig.center.x],
+        [0.0, rig.focal.y, rig.center.y],
+        [0.0, 0.0, 1.0]
+    ]);
+    let transforms = json!({"intrinsic_matrix": matrix, "frames": rig.frames(|name| format!("images/{name}.png"))});
+    assert_rays(&rig, &rig.dataset(&transforms).open().unwrap());
+}
+
+#[test]
+fn three_rows_and_a_scale_make_a_pose_too() {
+    let rig = Rig::skewed(3);
+    let mut transforms = rig.transforms(json!({}));
+    for frame in transforms["frames"].as_array_mut().unwrap() {
+        let rows = frame["transform_matrix"].as_array_mut().unwrap();
+        rows.pop();
+        for row in rows {
+            for entry in &mut row.as_array_mut().unwrap()[..3] {
+                *entry = json!(entry.as_f64().unwrap() * 2.5);
+            }
+        }
+    }
+    assert_rays(&rig, &rig.dataset(&transforms).open().unwrap());
+}
+
+#[test]
+fn lens_keys_choose_the_model() {
+    let rig = Rig::skewed(2);
+    let cases = [
+        (json!({}), CameraModel::Pinhole, vec![]),
+        (
+            json!({"k1": 0.1, "k2": 0.2, "p1": 0.3, "p2": 0.4}),
+            CameraModel::Opencv,
+            vec![0.1, 0.2, 0.3, 0.4],
+        ),
+        (
+            json!({"k1": 0.1, "k2": 0.2, "k3": 0.5, "p1": 0.3, "p2": 0.4}),
+            CameraModel::FullOpencv,
+            vec![0.1, 0.2, 0.3, 0.4, 0.5, 0.0, 0.0, 0.0],
+        ),
+        (
+            json!({"k1": 0.1, "k2": 0.2, "k3": 0.3, "k4": 0.4, "is_fisheye": true}),
+            CameraModel::OpencvFisheye,
+            vec![0.1, 0.2, 0.3, 0.4],
+        ),
+        (
+            json!({"k1": 0.1, "k2": 0.2, "k3": 0.3, "k4": 0.4, "camera_model": "OPENCV_FISHEYE"}),
+            CameraModel::OpencvFisheye,
+            vec![0.1, 0.2, 0.3, 0.4],
+        ),
+    ];
+    for (keys, model, distortion) in cases {
+        let scene = rig.dataset(&rig.transforms(keys)).open().unwrap();
+        let camera = &scene.views[0].camera;
+        assert_eq!(camera.model, model);
+        let mut wanted = vec![rig.focal.x, rig.focal.y, rig.center.x, rig.center.y];
+        wanted.extend(distortion);
+        assert_eq!(camera.params, wanted);
+    }
+}
+
+#[test]
+fn held_out_views_come_from_the_dataset_or_every_eighth() {
+    let rig = Rig::skewed(20);
+    let splits = |scene: &Scene| {
+        (
+            scene.split(Split::Train).count(),
+            scene.split(Split::Test).count(),
+        )
+    };
+
+    let dataset = rig.dataset(&rig.transforms(json!({})));
+    let open = |holdout| {
+        let options = SceneOptions {
+            holdout,
+            ..SceneOptions::default()
+        };
+        Scene::open(dataset.path(), &options)
+    };
+    let scene = open(8).unwrap();
+    assert_eq!(scene.split(Split::Test).collect::<Vec<_>>(), [0, 8, 16]);
+    assert_eq!(splits(&open(0).unwrap()), (20, 0));
+    assert_eq!(
+        splits(&open(15).unwrap()),
+        (20, 0),
+        "two held out of twenty would leave too little to tell"
+    );
+    assert!(open(1).is_err());
+
+    // A file of its own; one picture stands in both, and must not be trained on.
+    let mut train = rig.clone();
+    train.views.truncate(17);
+    let dataset = rig.dataset(&train.transforms(json!({})));
+    let mut test = rig.clone();
+    test.views.drain(..16);
+    dataset.write(
+        "transforms_test.json",
+        test.transforms(json!({})).to_string(),
+    );
+    let scene = Scene::open(dataset.path(), &SceneOptions::default()).unwrap();
+    assert_eq!(splits(&scene), (16, 4));
+    assert!(
+        scene
+            .notes
+            .iter()
+            .any(|note| note.contains("1 views are in")),
+        "{:?}",
+        scene.notes
+    );
+
+    // nerfstudio's lists.
+    let names = |range: std::ops::Range<usize>| -> Vec<String> {
+        rig.views[range]
+            .iter()
+            .map(|(name, _)| format!("images/{name}.png"))
+            .collect()
+    };
+    let lists = json!({"train_filenames": names(0..15), "test_filenames": names(15..18)});
+    let scene = rig.dataset(&rig.transforms(lists)).open().unwrap();
+    assert_eq!(splits(&scene), (15, 3));
+    assert_eq!(scene.skipped[0].what, "2 frames");
+}
+
+#[test]
+fn points_come_from_the_ply_file_named() {
+    let rig = Rig::skewed(3);
+    let dataset = rig.dataset(&rig.transforms(json!({"ply_file_path": ".\\sparse_pc.ply"})));
+    let header = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\n\
+                  property uint8 red\nproperty uint8 green\nproperty uint8 blue\nend_header\n";
+    dataset.write(
+        "sparse_pc.ply",
+        format!("{header}1 2 3 4 5 6\n-1 0.5 7 255 0 9\n"),
+    );
+    let points = dataset.open().unwrap().points;
+    assert_eq!(points.len(), 2);
+    assert_eq!(
+        (points[1].position, points[1].color),
+        (DVec3::new(-1.0, 0.5, 7.0), [255, 0, 9])
+    );
+
+    fs::remove_file(dataset.at("sparse_pc.ply")).unwrap();
+    let scene = dataset.open().unwrap();
+    assert!(scene.points.is_empty());
+    assert!(
+        scene.skipped[0].why.contains("ply_file_path"),
+        "{:?}",
+        scene.skipped
+    );
+}
+
+#[test]
+fn points_of_a_model_beside_transforms_are_used_if_its_cameras_agree() {
+    let rig = Rig::skewed(6);
+    let dataset = rig.dataset(&rig.transforms(json!({})));
+    rig.write_colmap_binary(&dataset.at("sparse/0"));
+    let scene = dataset.open().unwrap();
+    assert_eq!(scene.format, Format::Nerfstudio);
+    assert_eq!(scene.points.len(), rig.points.len());
+
+    // Another frame of reference, as nerfstudio makes it: refused unless the file says how it was made.
+    let applied = DMat4::from_rotation_translation(
+        glam::DQuat::from_rotation_x(1.0),
+        DVec3::new(3.0, 0.0, 1.0),
+    );
+    let mut moved = rig.clone();
+    for (_, pose) in &mut moved.views {
+        *pose = applied * *pose;
+    }
+    let dataset = moved.dataset(&moved.transforms(json!({})));
+    rig.write_colmap_binary(&dataset.at("sparse/0"));
+    let scene = dataset.open().unwrap();
+    assert!(scene.points.is_empty());
+    assert!(
+        scene.skipped[0].why.contains("another frame"),
+        "{:?}",
+        scene.skipped
+    );
+
+    let rows: Vec<[f64; 4]> = (0..3).map(|row| applied.row(row).to_array()).collect();
+    dataset.write(
+        "transforms.json",
+        moved
+            .transforms(json!({"applied_transform": rows}))
+            .to_string(),
+    );
+    let scene = dataset.open().unwrap();
+    assert_eq!(scene.points.len(), rig.points.len());
+    let wanted = applied.transform_point3(rig.points[7]);
+    assert!((scene.points[7].position - wanted).length() < 1e-9);
+}
+
+#[test]
+fn fields_of_view_in_degrees_are_read() {
+    let rig = Rig::around_a_ball(3);
+    let degrees = |side: u32, focal: f64| 2.0 * (0.5 * f64::from(side) / focal).atan().to_degrees();
+    let transforms = json!({
+        "x_fov": degrees(64, 70.0), "y_fov": degrees(48, 70.0),
+        "frames": rig.frames(|name| format!("images/{name}.png")),
+    });
+    let scene = rig.dataset(&transforms).open().unwrap();
+    assert_rays(&rig, &scene);
+    let centre = scene.views[0].camera.direction(DVec2::new(32.0, 24.0));
+    assert!((centre - DVec3::NEG_Z).length() < 1e-12);
+}

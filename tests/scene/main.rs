@@ -1,0 +1,10 @@
+//! Scenes as they come from disk: layouts, lenses, pictures, regions, and what is wrong with them.
+
+mod bad_input;
+mod cameras;
+mod fixtures;
+mod hostile;
+mod layouts;
+mod pictures;
+mod real;
+mod regions;

@@ -1,0 +1,245 @@
+//! The f64 twin's own gradients against central differences, and the tables and bases that it is built on.
+
+mod reference;
+
+use reference::background::{self, Background};
+use reference::batch::{Outcome, Step};
+use reference::hash_grid::Grid;
+use reference::losses::BiasReduction;
+use reference::networks::spherical_harmonics;
+use reference::sampling::{self, Region, Stretch};
+use reference::trial::{self, Random};
+
+/// What a span's gradient belongs to. No gradient flows from the interlevel loss through the final weights, which it takes as they
+/// are, so differences of the surface's parameters must leave it out; the proposal networks have no other loss.
+fn objective(outcome: &Outcome, span: &str) -> f64 {
+    let interlevel = outcome.losses["interlevel"];
+    if span.starts_with("proposal") {
+        interlevel
+    } else {
+        outcome.losses["total"] - interlevel
+    }
+}
+
+/// Compares sampled gradients of every span with central differences of step 1e-6, at fixed sample positions (no gradient flows
+/// through those). The seeds are such that no sampled difference straddles a kink (ReLU, |C − target|, the hinges, the heaviest sample).
+fn check_gradients(mut step: Step, seed: u64) {
+    let outcome = step.run();
+    step.edges = Some(outcome.images.edges.clone());
+    for (name, loss) in &outcome.losses {
+        assert!(*loss > 0.0, "the {name} loss is {loss}: nothing is tested");
+    }
+    let random = &mut Random(seed);
+    let spans: Vec<String> = step.params.keys().cloned().collect();
+    for span in spans {
+        let gradient = &outcome.gradients[&span];
+        let touched: Vec<usize> = (0..gradient.len())
+            .filter(|&i| gradient[i] != 0.0)
+            .collect();
+        assert!(!touched.is_empty(), "{span} has no gradient");
+        let largest = (0..gradient.len()).fold(0, |best, i| {
+            if gradient[i].abs() > gradient[best].abs() {
+                i
+            } else {
+                best
+            }
+        });
+        let some = |random: &mut Random, n: usize| (random.uniform() * n as f64) as usize;
+        let mut sampled = vec![largest, some(random, gradient.len())];
+        sampled.extend((0..4).map(|_| touched[some(random, touched.len())]));
+        for i in sampled {
+            let value = step.params[&span][i];
+            let mut at = |value: f64| {
+                step.params.get_mut(&span).expect("a span")[i] = value;
+                objective(&step.run(), &span)
+            };
+            let difference = (at(value + 1e-6) - at(value - 1e-6)) / 2e-6;
+            at(value);
+            let error = (difference - gradient[i]).abs();
+            let allowed =
+                1e-3 * gradient[i].abs() + (1e-4 * gradient[largest].abs()).clamp(1e-9, 1e-5);
+            assert!(
+                error <= allowed,
+                "{span}[{i}]: gradient {}, central difference {difference}",
+                gradient[i]
+            );
+        }
+    }
+}
+
+#[test]
+fn gradients_outdoors_with_one_background_color() {
+    check_gradients(trial::step(trial::config(), 24, 1), 2);
+}
+
+#[test]
+fn gradients_outdoors_with_a_background_field() {
+    for contraction in [true, false] {
+        let field = background::FieldConfig {
+            contraction,
+            ..trial::background_field()
+        };
+        let config = reference::batch::StepConfig {
+            background: Background::Field(field),
+            ..trial::config()
+        };
+        check_gradients(trial::step(config, 16, 3), 4);
+    }
+}
+
+#[test]
+fn gradients_indoors() {
+    let config = reference::batch::StepConfig {
+        region: Region::Box {
+            half: [1.0, 0.7, 0.8],
+        },
+        background: Background::Black,
+        bias_needs_opaque: false,
+        bias_reduction: BiasReduction::Published,
+        bias_offset: 0.01,
+        grid: Grid::published(3, 4, 32, 10, 8),
+        appearance: 0,
+        ..trial::config()
+    };
+    let mut step = trial::step(config, 16, 5);
+    // A bound that holds for half of the samples.
+    let mut scales = step.run().images.inv_s;
+    scales.sort_by(f64::total_cmp);
+    step.now.inv_s_lower = scales[scales.len() / 2];
+    check_gradients(step, 6);
+}
+
+#[test]
+fn masked_rays_have_no_color_loss() {
+    let mut step = trial::step(trial::config(), 6, 7);
+    let all = step.run();
+    let half: f64 = all.images.color_error[..3].iter().sum::<f64>() / 3.0;
+    step.rays.target[3..]
+        .iter_mut()
+        .for_each(|target| target[3] = 0.0);
+    step.now.inv_count = 1.0 / 3.0;
+    assert!((step.run().losses["color"] - half).abs() < 1e-14);
+}
+
+#[test]
+fn published_level_tables() {
+    let resolutions = |grid: Grid| {
+        grid.levels
+            .iter()
+            .map(|level| level.resolution)
+            .collect::<Vec<_>>()
+    };
+    let surface = Grid::published(16, 32, 2048, 19, 8);
+    assert_eq!(surface.entries(), 6_984_576);
+    assert_eq!(surface.parameters(), 55_876_608);
+    assert_eq!(
+        resolutions(surface),
+        [
+            32, 43, 56, 74, 98, 129, 169, 223, 295, 389, 513, 676, 892, 1177, 1553, 2049
+        ]
+    );
+    let surface = Grid::published(16, 32, 2048, 22, 8);
+    assert_eq!(surface.entries(), 45_724_048);
+    assert_eq!(surface.levels.iter().filter(|level| level.dense).count(), 6);
+    let entries = |grid: Grid| {
+        grid.levels
+            .iter()
+            .map(|level| level.entries)
+            .collect::<Vec<_>>()
+    };
+    assert_eq!(
+        entries(Grid::published(5, 16, 64, 17, 2)),
+        [4096, 12168, 32768, 97336, 131_072]
+    );
+    assert_eq!(
+        entries(Grid::published(5, 16, 256, 17, 2)),
+        [4096, 32768, 131_072, 131_072, 131_072]
+    );
+    let background = Grid::published(16, 16, 1024, 19, 2);
+    assert_eq!(background.parameters(), 11_445_040);
+    assert_eq!(resolutions(background)[..6], [16, 22, 28, 37, 49, 65]);
+}
+
+#[test]
+fn exact_scales_and_published_ones_agree_to_single_precision() {
+    let (exact, published) = (
+        Grid::exact(12, 16, 1024, 17, 2),
+        Grid::published(12, 16, 1024, 17, 2),
+    );
+    for (a, b) in exact.levels.iter().zip(&published.levels) {
+        assert!(
+            (a.scale - b.scale).abs() <= 1e-6 * a.scale,
+            "{} and {}",
+            a.scale,
+            b.scale
+        );
+    }
+}
+
+/// ∫ Y_i Y_j = δ_ij over the sphere, by midpoints in z and in the angle around it.
+#[test]
+fn spherical_harmonics_are_orthonormal() {
+    let (rings, steps) = (2000, 24);
+    let mut products = [[0.0; 16]; 16];
+    for ring in 0..rings {
+        let z = 2.0 * (ring as f64 + 0.5) / rings as f64 - 1.0;
+        for step in 0..steps {
+            let angle = std::f64::consts::TAU * (step as f64 + 0.5) / steps as f64;
+            let radius = (1.0 - z * z).sqrt();
+            let harmonics = spherical_harmonics([radius * angle.cos(), radius * angle.sin(), z]);
+            let area = 4.0 * std::f64::consts::PI / (rings * steps) as f64;
+            for (row, a) in products.iter_mut().zip(harmonics) {
+                row.iter_mut()
+                    .zip(harmonics)
+                    .for_each(|(sum, b)| *sum += area * a * b);
+            }
+        }
+    }
+    for (i, row) in products.iter().enumerate() {
+        for (j, product) in row.iter().enumerate() {
+            assert!(
+                (product - f64::from(u8::from(i == j))).abs() < 1e-5,
+                "harmonics {i}, {j}: {product}"
+            );
+        }
+    }
+}
+
+#[test]
+fn rays_meet_a_box_where_they_enter_and_leave_it() {
+    let half = [1.0, 0.5, 0.8];
+    let random = &mut Random(8);
+    let mut met = 0;
+    for _ in 0..200 {
+        let origin = random.direction().map(|x| 1.5 * x);
+        let direction = random.direction();
+        let Stretch { near, far, outside } = sampling::collide_box(half, origin, direction);
+        let inside = |t: f64| {
+            let x = sampling::point_on_ray(origin, direction, t);
+            (0..3).all(|axis| x[axis].abs() <= half[axis])
+        };
+        let samples = (0..400).map(|i| (f64::from(i) + 0.5) * 0.01);
+        if outside {
+            assert!(samples.clone().filter(|&t| inside(t)).count() < 2);
+        } else {
+            met += 1;
+            for t in samples {
+                assert_eq!(
+                    inside(t),
+                    near < t && t < far,
+                    "near {near}, far {far}, t {t}"
+                );
+            }
+        }
+    }
+    assert!(met > 20);
+    let through = sampling::collide_box(half, [0.0; 3], [0.0, 1.0, 0.0]);
+    assert_eq!(
+        through,
+        Stretch {
+            near: 0.0,
+            far: 0.5,
+            outside: false
+        }
+    );
+}
