@@ -135,7 +135,9 @@ pub struct Constant {
 
 impl Constant {
     fn new(gpu: &Gpu, plan: &mut ParamsPlan, sky: [f32; 3]) -> Result<Constant> {
-        let logits = sky.map(|c| c.clamp(0.01, 0.99)).map(|c| (c / (1.0 - c)).ln());
+        let logits = sky
+            .map(|c| c.clamp(0.01, 0.99))
+            .map(|c| (c / (1.0 - c)).ln());
         Ok(Constant {
             logits: plan.add(
                 Group::Background,

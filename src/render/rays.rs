@@ -105,8 +105,13 @@ impl BorderColors {
 
     /// Mean of the fullest bin; grey without pictures. Ties go to the darker one, so that the answer does not depend on hashing.
     fn commonest(&self) -> [f32; 3] {
-        let fullest = self.bins.iter().max_by_key(|(bin, (count, _))| (*count, std::cmp::Reverse(**bin)));
-        fullest.map_or([0.5; 3], |(_, (count, sum))| sum.map(|s| s as f32 / (*count as f32 * 255.0)))
+        let fullest = self
+            .bins
+            .iter()
+            .max_by_key(|(bin, (count, _))| (*count, std::cmp::Reverse(**bin)));
+        fullest.map_or([0.5; 3], |(_, (count, sum))| {
+            sum.map(|s| s as f32 / (*count as f32 * 255.0))
+        })
     }
 }
 
