@@ -1,6 +1,7 @@
 #version 460
-// Adjoint of background_composite_forward, one ray per invocation. With C_after the colour behind sample i,
-//   ∂C/∂τ_i = T_{i+1} c_i − C_after,  ∂τ_i/∂out_i = τ_i.
+// Adjoint of background_composite_forward, one ray per invocation, by the recursion of composite_backward from the back:
+//   g_i = d_color · c_i (0 behind the last sample),  D_i = g_i − g_{i+1} + e^{−τ_{i+1}} D_{i+1},  d_τ_i = T_{i+1} D_i,  ∂τ_i/∂out_i = τ_i.
+// Nothing is subtracted from a running sum: far bins are hundreds of units long, and τ_i would multiply what rounding leaves of it.
 #include "lib/prelude.glsl"
 
 layout(push_constant, scalar) uniform Args {
@@ -19,20 +20,34 @@ void main() {
     uint ray = item();
     if (ray >= n_rays) return;
     uint n = n_rays * n_samples;
-    vec3 behind = vec3(color.at[ray], color.at[n_rays + ray], color.at[2u * n_rays + ray]);
     vec3 d_c = vec3(d_color.at[ray], d_color.at[n_rays + ray], d_color.at[2u * n_rays + ray]);
+
+    // Forward: the transmittance after each sample, left in d_raw until the way back overwrites it.
     float depth = 0.0;
     for (uint s = 0u; s < n_samples; ++s) {
         uint p = ray * n_samples + s;
         uint e = ray * (n_samples + 1u) + s;
+        depth += exp(min(raw.at[p], 15.0)) * (edges.at[e + 1u] - edges.at[e]);
+        d_raw.at[p] = exp(-depth);
+    }
+
+    float next_worth = 0.0, passed = 0.0, advantage = 0.0; // g_{i+1}, e^{−τ_{i+1}}, D_{i+1}
+    for (uint k = 0u; k < n_samples; ++k) {
+        uint s = n_samples - 1u - k;
+        uint p = ray * n_samples + s;
+        uint e = ray * (n_samples + 1u) + s;
         float out_ = raw.at[p];
         float tau = exp(min(out_, 15.0)) * (edges.at[e + 1u] - edges.at[e]);
-        float after = exp(-depth - tau);
-        float w = exp(-depth) - after;
-        vec3 c = vec3(rgb.at[p], rgb.at[n + p], rgb.at[2u * n + p]);
-        behind -= w * c;
-        d_raw.at[p] = out_ > 15.0 ? 0.0 : tau * dot(d_c, after * c - behind);
-        [[unroll]] for (uint k = 0u; k < 3u; ++k) d_rgb.at[k * n + p] = w * d_c[k];
-        depth += tau;
+        float w = 1.0 - exp(-tau);
+        if (s > 0u) w *= d_raw.at[p - 1u];
+        float worth = 0.0;
+        [[unroll]] for (uint c = 0u; c < 3u; ++c) {
+            worth += d_c[c] * rgb.at[c * n + p];
+            d_rgb.at[c * n + p] = w * d_c[c];
+        }
+        advantage = worth - next_worth + passed * advantage;
+        d_raw.at[p] = out_ > 15.0 ? 0.0 : tau * d_raw.at[p] * advantage;
+        next_worth = worth;
+        passed = exp(-tau);
     }
 }
