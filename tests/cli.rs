@@ -9,7 +9,16 @@ use std::time::{Duration, Instant};
 
 /// The program, in an environment without anyone's settings.
 fn neurodin(words: &[&str]) -> Command {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_neurodin"));
+    let program = env!("CARGO_BIN_EXE_neurodin");
+    // A private Mesa has a C library of its own, with which its programs have to be started.
+    let mut command = match std::env::var_os("NEURODIN_LAUNCHER") {
+        Some(launcher) => {
+            let mut command = Command::new(launcher);
+            command.arg(program);
+            command
+        }
+        None => Command::new(program),
+    };
     for (name, _) in std::env::vars_os() {
         if name.to_string_lossy().starts_with("NEURODIN_") {
             command.env_remove(name);
