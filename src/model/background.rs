@@ -41,7 +41,7 @@ impl Background {
     /// The field's shape in this configuration, if its background has one.
     pub fn field_shape(config: &Config) -> Option<FieldShape> {
         let b = &config.background;
-        (b.kind == BackgroundKind::Field).then(|| FieldShape {
+        (b.kind == BackgroundKind::Field).then_some(FieldShape {
             grid: HashGrid {
                 levels: b.levels,
                 base: b.base,
