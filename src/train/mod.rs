@@ -251,7 +251,6 @@ impl Trainer {
     /// Renders view `view` of the scene at its picture's size, at the current step.
     pub fn render(
         &self,
-        scene: &Scene,
         view: usize,
         size: (u32, u32),
         keep_going: &mut dyn FnMut(f64) -> bool,
@@ -266,7 +265,6 @@ impl Trainer {
             AppearanceAtEval::Frame if row < n_training => row,
             _ => n_training,
         };
-        let _ = scene;
         self.render_row(row, size, appearance, keep_going)
     }
 

@@ -40,7 +40,7 @@ impl Rig {
         let region = Region {
             center: CENTER,
             radius: RADIUS,
-            shape: shape,
+            shape,
             how: "given".into(),
         };
         let config = config.validated()?;
