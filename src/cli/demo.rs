@@ -1,5 +1,539 @@
-//! `neurodin demo`: the built-in scene from photographs to a scored mesh and a report.
+//! `neurodin demo`: the built-in scene from photographs to a scored mesh and a report about it, on this machine.
+//!
+//! Every stage is what a user's own photographs go through: a dataset on disk, a run directory, a mesh file. Only the surface is known
+//! here, so that the mesh can be scored against the truth.
 
 pub mod chart;
 pub mod mesh_picture;
 pub mod report;
+mod summary;
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Instant;
+
+use anyhow::Context as _;
+use clap::Args;
+use serde_json::json;
+
+use super::progress::Progress;
+use super::{Context, diagnostics, interrupt};
+use crate::config::Config;
+use crate::eval::{self, GeometryOptions, GeometryScores, Reference};
+use crate::gpu::{Gpu, GpuOptions, Profile};
+use crate::mesh::{self, ExtractOptions, Field, Mesh};
+use crate::render::Rendered;
+use crate::scene::synthetic::{self, SyntheticDataset, SyntheticOptions};
+use crate::scene::{Picture, Region, Scene, Split, View};
+use crate::train::Trainer;
+use crate::train::report::{Control, Event, Log};
+use crate::train::run_directory::{RunDirectory, SceneRecord, scene_options};
+use crate::{Error, Result};
+
+/// Reconstruct the built-in scene and report on it
+#[derive(Args)]
+#[command(after_help = "\
+Example:
+  neurodin demo
+  neurodin demo --out tour --steps 10000
+  neurodin demo --minutes 2 --resolution 256
+
+Writes to the output directory: dataset/ (photographs, cameras, ground truth), run/ (settings, log, previews, checkpoints),
+mesh.ply, scores.json, pictures/ and report.html.")]
+pub(super) struct DemoArgs {
+    /// Directory to write
+    #[arg(short, long, value_name = "DIR", default_value = "demo-out")]
+    pub out: PathBuf,
+    /// Training steps [default: what fits into the time, at most those of the preset]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
+    pub steps: Option<u64>,
+    /// Time for training
+    #[arg(long, value_name = "M", default_value_t = 5.0, value_parser = minutes, conflicts_with = "steps")]
+    pub minutes: f64,
+    /// Seed of every random number of the training
+    #[arg(long, value_name = "N")]
+    pub seed: Option<u32>,
+    /// Photographs to train on
+    #[arg(long, value_name = "N", default_value_t = 48, value_parser = clap::value_parser!(u32).range(2..=1000))]
+    pub views: u32,
+    /// Width of the photographs in pixels; they are three quarters as high
+    #[arg(long, value_name = "PIXELS", default_value_t = 240, value_parser = clap::value_parser!(u32).range(16..=4096))]
+    pub width: u32,
+    /// Cells of the mesh along the longest side of the region
+    #[arg(long, value_name = "N", default_value_t = 512, value_parser = clap::value_parser!(u32).range(32..=4096))]
+    pub resolution: u32,
+    /// Replace what a former demo wrote to the directory
+    #[arg(long)]
+    pub force: bool,
+}
+
+fn minutes(text: &str) -> Result<f64, String> {
+    match text.parse() {
+        Ok(minutes) if (0.1..=1440.0).contains(&minutes) => Ok(minutes),
+        _ => Err("expected minutes from 0.1 to 1440".into()),
+    }
+}
+
+const PRESET: &str = "outdoor-tiny";
+/// Steps before and while kernels are timed.
+const WARMUP: u64 = 4;
+const TIMED: u64 = 24;
+/// A run is a multiple of this many steps, and at least as many.
+const STEP_GRAIN: u64 = 50;
+/// Distances at which the mesh is scored, as shares of the scene's radius.
+const THRESHOLDS: [f64; 3] = [0.005, 0.01, 0.02];
+
+/// All that the report is made of.
+pub(super) struct Outcome {
+    dataset: SyntheticDataset,
+    config: Config,
+    device: String,
+    driver: String,
+    profile: Profile,
+    /// Share of the timed steps' wall time that the kernels' times cover.
+    coverage: f64,
+    views: Vec<Seen>,
+    mesh: Mesh,
+    scores: GeometryScores,
+    /// Stage and seconds.
+    stages: Vec<(String, f64)>,
+    /// The training's log, as written.
+    log: String,
+}
+
+/// A held-out view: the photograph, what the field shows there, and how alike they are.
+pub(super) struct Seen {
+    name: String,
+    picture: Picture,
+    rendered: Rendered,
+    psnr: f64,
+    ssim: f64,
+}
+
+pub(super) fn run(args: &DemoArgs, context: &Context) -> anyhow::Result<()> {
+    let mut demo = Demo::begin(args, context)?;
+    // Photographs, and the device: the two things that a reconstruction needs.
+    let dataset = demo.stage("photographs", Demo::photographs)?;
+    let gpu = context.gpu()?;
+    let config = demo.config()?;
+    let scene = Scene::open(&dataset.root, &scene_options(&config))?;
+    let region = Region::estimate(
+        &scene,
+        &super::train::region_wanted(&Default::default(), &config),
+    )?;
+    context.say(&format!("device   {}", gpu.info().name));
+    // A few timed steps say where the time goes, and how many steps fit into it.
+    let timing = demo.stage("timing", |demo| demo.timing(&scene, &region, &config))?;
+    let config = demo.with_steps(config, timing.seconds_per_step)?;
+    // What `neurodin train`, `mesh`, `render` and `eval` do.
+    let trainer = demo.stage("training", |demo| {
+        demo.training(&gpu, &scene, &region, &config, &dataset)
+    })?;
+    let mesh = demo.stage("mesh", |demo| demo.mesh(&gpu, &trainer, &region))?;
+    let views = demo.stage("held-out views", |demo| demo.views(&trainer, &scene))?;
+    let scores = demo.stage("scores", |_| scores(&mesh, &dataset, &scene))?;
+    let outcome = Outcome {
+        device: gpu.info().name.clone(),
+        driver: gpu.info().driver.clone(),
+        log: demo.log()?,
+        profile: timing.profile,
+        coverage: timing.coverage,
+        dataset,
+        config,
+        views,
+        mesh,
+        scores,
+        stages: Vec::new(),
+    };
+    demo.report(outcome)
+}
+
+/// A demonstration on its way.
+struct Demo<'c> {
+    args: &'c DemoArgs,
+    context: &'c Context,
+    interrupted: std::sync::Arc<AtomicBool>,
+    began: Instant,
+    /// Stage and seconds, as they end.
+    stages: Vec<(String, f64)>,
+}
+
+/// What a few steps took.
+struct Timing {
+    seconds_per_step: f64,
+    profile: Profile,
+    coverage: f64,
+}
+
+impl<'c> Demo<'c> {
+    /// Refuses an output that is in the way before anything takes time.
+    fn begin(args: &'c DemoArgs, context: &'c Context) -> anyhow::Result<Demo<'c>> {
+        let out = &args.out;
+        let occupied =
+            fs::read_dir(out).map_or(out.exists(), |mut entries| entries.next().is_some());
+        if occupied {
+            if !args.force || !out.join(DATASET).join("transforms.json").is_file() {
+                return Err(Error::output(
+                    out,
+                    "exists already",
+                    "give another --out, or replace a former demo's with --force",
+                )
+                .into());
+            }
+            for entry in [DATASET, RUN, PICTURES] {
+                let path = out.join(entry);
+                if path.exists() {
+                    fs::remove_dir_all(&path).map_err(|e| Error::io(path, e))?;
+                }
+            }
+        }
+        fs::create_dir_all(out).map_err(|e| Error::io(out, e))?;
+        Ok(Demo {
+            args,
+            context,
+            interrupted: interrupt::flag("stopping")?,
+            began: Instant::now(),
+            stages: Vec::new(),
+        })
+    }
+
+    /// Runs one stage and notes how long it took.
+    fn stage<T>(
+        &mut self,
+        name: &str,
+        work: impl FnOnce(&mut Self) -> anyhow::Result<T>,
+    ) -> anyhow::Result<T> {
+        self.context.say(&format!("\n{name}"));
+        let begun = Instant::now();
+        let result = work(self)?;
+        self.stages
+            .push((name.into(), begun.elapsed().as_secs_f64()));
+        Ok(result)
+    }
+
+    fn going_on(&self) -> bool {
+        !self.interrupted.load(Ordering::SeqCst)
+    }
+
+    /// [`Error::Interrupted`] once Ctrl-C was pressed.
+    fn check(&self) -> Result<()> {
+        if self.going_on() {
+            return Ok(());
+        }
+        Err(Error::Interrupted {
+            what: format!(
+                "stopped; what was done so far is in {}",
+                self.args.out.display()
+            ),
+        })
+    }
+
+    fn photographs(&mut self) -> anyhow::Result<SyntheticDataset> {
+        let options = SyntheticOptions {
+            train_views: self.args.views as usize,
+            width: self.args.width,
+            height: self.args.width * 3 / 4,
+            ..SyntheticOptions::default()
+        };
+        let mut shown: Option<(String, Progress)> = None;
+        let dataset = options.write(&self.args.out.join(DATASET), &mut |what, done, total| {
+            if shown.as_ref().is_none_or(|(before, _)| before != what) {
+                // The bar of the part before goes first.
+                shown = None;
+                shown = Some((what.into(), Progress::new(self.context, what, total as u64)));
+            }
+            if let Some((_, progress)) = &mut shown {
+                progress.at(done as u64, "");
+            }
+        })?;
+        drop(shown);
+        self.context.say(&format!(
+            "{} + {} photographs of {}×{} pixels, and {} points of the exact surface, in {}",
+            dataset.train.len(),
+            dataset.test.len(),
+            options.width,
+            options.height,
+            dataset.reference_points,
+            dataset.root.display()
+        ));
+        self.check()?;
+        Ok(dataset)
+    }
+
+    fn config(&self) -> Result<Config> {
+        let config = Config::preset(PRESET)?;
+        match self.args.seed {
+            Some(seed) => config.with_assignment(&format!("seed={seed}")),
+            None => Ok(config),
+        }
+    }
+
+    /// Trains for a few steps that are thrown away: the first ones compile the kernels, the others are timed, kernel by kernel.
+    fn timing(
+        &mut self,
+        scene: &Scene,
+        region: &Region,
+        config: &Config,
+    ) -> anyhow::Result<Timing> {
+        let gpu = self.context.gpu_with(GpuOptions {
+            profile: true,
+            ..GpuOptions::default()
+        })?;
+        let mut trainer = Trainer::new(&gpu, scene, region, config)?;
+        let mut progress = Progress::new(self.context, "timing", WARMUP + TIMED);
+        let mut steps = |trainer: &mut Trainer, count: u64, note: &str| -> Result<()> {
+            for _ in 0..count {
+                trainer.step()?;
+                progress.at(trainer.steps_done(), note);
+                self.check()?;
+            }
+            trainer.finish()?;
+            Ok(())
+        };
+        steps(&mut trainer, WARMUP, "the device compiles the kernels")?;
+        gpu.reset_profile()?;
+        let begun = Instant::now();
+        steps(&mut trainer, TIMED, "")?;
+        let wall = begun.elapsed().as_secs_f64();
+        drop(progress);
+        let profile = gpu.profile()?;
+        let device: f64 = profile.rows.iter().map(|row| row.total_ms * 1e-3).sum();
+        let seconds_per_step = wall / TIMED as f64;
+        self.context
+            .say(&format!("{:.1} ms a step", 1e3 * seconds_per_step));
+        Ok(Timing {
+            seconds_per_step,
+            profile,
+            coverage: device / wall,
+        })
+    }
+
+    /// As many steps as were asked for, or as fit into the time.
+    fn with_steps(&self, config: Config, seconds_per_step: f64) -> Result<Config> {
+        let steps = self.args.steps.unwrap_or_else(|| {
+            let fit = (60.0 * self.args.minutes / seconds_per_step) as u64;
+            (fit / STEP_GRAIN * STEP_GRAIN).clamp(STEP_GRAIN, config.steps)
+        });
+        self.context.say(&format!(
+            "{steps} steps will take about {}",
+            report::duration(steps as f64 * seconds_per_step)
+        ));
+        // The held-out view is looked at ten times, whatever the length of the run.
+        config
+            .with_assignment(&format!("steps={steps}"))?
+            .with_assignment(&format!("report.preview_steps={}", (steps / 10).max(1)))?
+            .with_assignment(&format!("report.log_steps={}", (steps / 400).max(1)))
+    }
+
+    /// A run directory as `neurodin train` makes it.
+    fn training(
+        &mut self,
+        gpu: &Gpu,
+        scene: &Scene,
+        region: &Region,
+        config: &Config,
+        dataset: &SyntheticDataset,
+    ) -> anyhow::Result<Trainer> {
+        let run = RunDirectory::create(&self.args.out.join(RUN), false)?;
+        run.write(
+            &run.scene(),
+            &SceneRecord::new(&dataset.root, scene, region)?.to_json(),
+        )?;
+        run.write(&run.config(), &config.to_toml())?;
+        let mut trainer = Trainer::new(gpu, scene, region, config)?;
+        let mut log = Log::append(&run.log())?;
+        let mut progress = Progress::new(self.context, "train", config.steps);
+        let (mut losses_now, mut psnr_now, mut failed) = (String::new(), String::new(), None);
+        let outcome = trainer.run(scene, &run, &mut |event| {
+            if let Err(error) = log.write(&event) {
+                failed.get_or_insert(error);
+            }
+            match &event {
+                Event::Advanced { step, .. } => {
+                    diagnostics::note_step(*step);
+                    progress.at(*step, &format!("{losses_now}{psnr_now}"));
+                }
+                Event::Step { losses, .. } => losses_now = format!("loss {:.4}", losses.total),
+                Event::Preview { psnr, .. } => psnr_now = format!(", held-out view {psnr:.2} dB"),
+                Event::Saved { path, .. } => diagnostics::note_checkpoint(path),
+                Event::Warning { what, .. } => self.context.warn(what),
+                _ => {}
+            }
+            match failed.is_none() && self.going_on() {
+                true => Control::Continue,
+                false => Control::Stop,
+            }
+        });
+        if let Some(error) = failed {
+            return Err(error.into());
+        }
+        outcome.context("while training")?;
+        Ok(trainer)
+    }
+
+    /// `mesh.ply` of the part of the region that the photographs are about.
+    fn mesh(&mut self, gpu: &Gpu, trainer: &Trainer, region: &Region) -> anyhow::Result<Mesh> {
+        let options = ExtractOptions {
+            resolution: self.args.resolution,
+            shape: region.shape,
+            world_from_region: region.world_from_region(),
+            crop: Some([
+                synthetic::CENTER - synthetic::RADIUS,
+                synthetic::CENTER + synthetic::RADIUS,
+            ]),
+            steepest: Some(4.0),
+            ..ExtractOptions::default()
+        };
+        let mut field = Field::new(gpu, trainer.config(), trainer.model())?;
+        let mut shown: Option<(mesh::extract::Stage, Progress)> = None;
+        let mesh = mesh::extract_mesh(&mut field, &options, &mut |now| {
+            if shown.as_ref().is_none_or(|(stage, _)| *stage != now.stage) {
+                let what = match now.stage {
+                    mesh::extract::Stage::Lattice => "surface",
+                    mesh::extract::Stage::Attributes => "colours",
+                };
+                shown = None;
+                shown = Some((now.stage, Progress::new(self.context, what, now.total)));
+            }
+            if let Some((_, progress)) = &mut shown {
+                progress.at(now.done, &format!("{} faces", now.faces));
+            }
+            self.going_on()
+        })?;
+        drop(shown);
+        let path = self.args.out.join(MESH);
+        mesh::write_mesh(&path, &mesh, self.args.force)?;
+        self.context.say(&format!(
+            "{} vertices, {} faces in {}",
+            mesh.positions.len(),
+            mesh.faces.len(),
+            path.display()
+        ));
+        Ok(mesh)
+    }
+
+    /// Renders every held-out view at its photograph's size.
+    fn views(&mut self, trainer: &Trainer, scene: &Scene) -> anyhow::Result<Vec<Seen>> {
+        let wanted: Vec<usize> = scene.split(Split::Test).collect();
+        let mut progress = Progress::new(self.context, "render", 1000 * wanted.len() as u64);
+        let mut views = Vec::new();
+        for (index, &view) in wanted.iter().enumerate() {
+            let View { name, camera, .. } = &scene.views[view];
+            let size = (camera.width, camera.height);
+            let rendered = trainer.render(view, size, &mut |share| {
+                progress.at((1000.0 * (index as f64 + share)) as u64, name);
+                self.going_on()
+            })?;
+            let picture = scene.load_picture(view)?;
+            let photo: Vec<f32> = picture
+                .rgba
+                .chunks(4)
+                .flat_map(|pixel| [0, 1, 2].map(|c| f32::from(pixel[c]) / 255.0))
+                .collect();
+            let shown: Vec<f32> = rendered
+                .rgb
+                .iter()
+                .flatten()
+                .map(|c| c.clamp(0.0, 1.0))
+                .collect();
+            let (width, height) = (size.0 as usize, size.1 as usize);
+            views.push(Seen {
+                name: name.clone(),
+                psnr: eval::psnr(&shown, &photo),
+                ssim: eval::ssim(&shown, &photo, width, height, 3).unwrap_or(f64::NAN),
+                picture,
+                rendered,
+            });
+        }
+        Ok(views)
+    }
+
+    fn log(&self) -> Result<String> {
+        let path = RunDirectory::open(&self.args.out.join(RUN))?.log();
+        fs::read_to_string(&path).map_err(|e| Error::io(path, e))
+    }
+
+    /// Writes the pictures, `scores.json` and `report.html`, and says what came out.
+    fn report(mut self, mut outcome: Outcome) -> anyhow::Result<()> {
+        let out = &self.args.out;
+        self.context.say("\nreport");
+        let begun = Instant::now();
+        let pictures = summary::Pictures::of(&outcome.mesh);
+        self.stages
+            .push(("report".into(), begun.elapsed().as_secs_f64()));
+        outcome.stages = std::mem::take(&mut self.stages);
+        let seconds = self.began.elapsed().as_secs_f64();
+
+        let page = out.join("report.html");
+        let folder = out.join(PICTURES);
+        fs::create_dir_all(&folder).map_err(|e| Error::io(&folder, e))?;
+        for (name, picture) in pictures.named() {
+            write_file(&folder.join(name), &picture.png())?;
+        }
+        let scores = summary::as_json(&outcome, seconds);
+        write_file(&out.join("scores.json"), format!("{scores:#}\n").as_bytes())?;
+        write_file(
+            &page,
+            summary::report(&outcome, pictures, seconds, out)
+                .html()
+                .as_bytes(),
+        )?;
+
+        let mut result = json!({ "report": page, "mesh": out.join(MESH), "run": out.join(RUN), "dataset": outcome.dataset.root });
+        if let (Some(result), serde_json::Value::Object(scores)) = (result.as_object_mut(), scores)
+        {
+            result.extend(scores);
+        }
+        let text = format!(
+            "{}\ndone in {}; look at {}",
+            summary::as_text(&outcome),
+            report::duration(seconds),
+            page.display()
+        );
+        Ok(self.context.result(&result, &text)?)
+    }
+}
+
+const DATASET: &str = "dataset";
+const RUN: &str = "run";
+const MESH: &str = "mesh.ply";
+const PICTURES: &str = "pictures";
+
+/// The mesh against the exact surface; what no training camera sees does not count.
+fn scores(
+    mesh: &Mesh,
+    dataset: &SyntheticDataset,
+    scene: &Scene,
+) -> anyhow::Result<GeometryScores> {
+    let reference = Reference::from_mesh(mesh::read_mesh(&dataset.reference)?);
+    let cameras: Vec<View> = scene
+        .split(Split::Train)
+        .map(|view| scene.views[view].clone())
+        .collect();
+    let options = GeometryOptions {
+        samples: 200_000,
+        seed: 0,
+        thresholds: THRESHOLDS.map(|share| share * synthetic::RADIUS).to_vec(),
+        trim: 0.05 * synthetic::RADIUS,
+        crop: None,
+        min_views: 1,
+        hidden_by: 0.01 * synthetic::RADIUS,
+    };
+    Ok(eval::score_geometry(
+        mesh,
+        &reference,
+        Some(&cameras),
+        &options,
+    )?)
+}
+
+fn write_file(path: &Path, bytes: &[u8]) -> Result<()> {
+    fs::write(path, bytes).map_err(|error| {
+        Error::output(
+            path,
+            format!("cannot be written: {error}"),
+            "make room or mend the permissions there",
+        )
+    })
+}

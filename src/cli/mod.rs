@@ -122,6 +122,7 @@ enum Command {
     Render(render::RenderArgs),
     Eval(eval::EvalArgs),
     Profile(Box<profile::ProfileArgs>),
+    Demo(demo::DemoArgs),
 }
 
 impl Command {
@@ -134,6 +135,7 @@ impl Command {
             Command::Render(args) => render::run(args, context),
             Command::Eval(args) => eval::run(args, context),
             Command::Profile(args) => profile::run(args, context),
+            Command::Demo(args) => demo::run(args, context),
         }
     }
 }
