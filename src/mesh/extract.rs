@@ -1,5 +1,5 @@
-//! From a signed distance field to a mesh, block by block, in memory that does not depend on the resolution (METHOD: marching cubes on a
-//! regular lattice over the region; a vertex outside the region takes its faces with it).
+//! From a signed distance field to a mesh, block by block, in memory that does not depend on the resolution: marching cubes on a regular
+//! lattice over the region; a vertex outside of the region takes its faces with it.
 //!
 //! Blocks share lattice points, not faces: vertices on the border between blocks are found again through a small map that holds only
 //! the borders of blocks still to come, so the mesh is the same, vertex for vertex, whatever the block size. For that the lattice's
