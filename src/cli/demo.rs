@@ -49,7 +49,7 @@ pub(super) struct DemoArgs {
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     pub steps: Option<u64>,
     /// Time for training
-    #[arg(long, value_name = "M", default_value_t = 5.0, value_parser = minutes, conflicts_with = "steps")]
+    #[arg(long, value_name = "M", default_value_t = 4.0, value_parser = minutes, conflicts_with = "steps")]
     pub minutes: f64,
     /// Seed of every random number of the training
     #[arg(long, value_name = "N")]
@@ -77,8 +77,8 @@ fn minutes(text: &str) -> Result<f64, String> {
 
 const PRESET: &str = "outdoor-tiny";
 /// Steps before and while kernels are timed.
-const WARMUP: u64 = 4;
-const TIMED: u64 = 24;
+const WARMUP: u64 = 3;
+const TIMED: u64 = 16;
 /// A run is a multiple of this many steps, and at least as many.
 const STEP_GRAIN: u64 = 50;
 /// Distances at which the mesh is scored, as shares of the scene's radius.
@@ -232,6 +232,7 @@ impl<'c> Demo<'c> {
     fn photographs(&mut self) -> anyhow::Result<SyntheticDataset> {
         let options = SyntheticOptions {
             train_views: self.args.views as usize,
+            test_views: (self.args.views as usize / 8).clamp(2, 6),
             width: self.args.width,
             height: self.args.width * 3 / 4,
             ..SyntheticOptions::default()
@@ -319,10 +320,11 @@ impl<'c> Demo<'c> {
             "{steps} steps will take about {}",
             report::duration(steps as f64 * seconds_per_step)
         ));
-        // The held-out view is looked at ten times, whatever the length of the run.
+        // A curve of some ten looks at the held-out view, small ones, since each costs as much as many steps.
         config
             .with_assignment(&format!("steps={steps}"))?
-            .with_assignment(&format!("report.preview_steps={}", (steps / 10).max(1)))?
+            .with_assignment(&format!("report.preview_steps={}", (steps / 10).max(50)))?
+            .with_assignment("report.preview_pixels=12000")?
             .with_assignment(&format!("report.log_steps={}", (steps / 400).max(1)))
     }
 
@@ -416,15 +418,22 @@ impl<'c> Demo<'c> {
     /// Renders every held-out view at its photograph's size.
     fn views(&mut self, trainer: &Trainer, scene: &Scene) -> anyhow::Result<Vec<Seen>> {
         let wanted: Vec<usize> = scene.split(Split::Test).collect();
-        let mut progress = Progress::new(self.context, "render", 1000 * wanted.len() as u64);
+        let pixels = |view: usize| {
+            let camera = &scene.views[view].camera;
+            u64::from(camera.width) * u64::from(camera.height)
+        };
+        let total = wanted.iter().map(|&view| pixels(view)).sum();
+        let mut progress = Progress::new(self.context, "render", total);
+        let mut done = 0;
         let mut views = Vec::new();
-        for (index, &view) in wanted.iter().enumerate() {
+        for &view in &wanted {
             let View { name, camera, .. } = &scene.views[view];
             let size = (camera.width, camera.height);
             let rendered = trainer.render(view, size, &mut |share| {
-                progress.at((1000.0 * (index as f64 + share)) as u64, name);
+                progress.at(done + (share * pixels(view) as f64) as u64, name);
                 self.going_on()
             })?;
+            done += pixels(view);
             let picture = scene.load_picture(view)?;
             let photo: Vec<f32> = picture
                 .rgba
@@ -518,7 +527,7 @@ fn scores(
         trim: 0.05 * synthetic::RADIUS,
         crop: None,
         min_views: 1,
-        hidden_by: 0.01 * synthetic::RADIUS,
+        hidden_by: 0.001 * synthetic::RADIUS,
     };
     Ok(eval::score_geometry(
         mesh,

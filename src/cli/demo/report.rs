@@ -349,7 +349,8 @@ impl Report {
             section(page, "Settings", "");
             let _ = write!(
                 page,
-                "<pre class=\"settings\">{}</pre></section>",
+                "<details><summary>Every setting of the run, as it would be given to --config</summary>\
+                 <pre class=\"settings\">{}</pre></details></section>",
                 escape(self.settings.trim())
             );
         }
