@@ -2,9 +2,12 @@
 // Hash grid, hidden layer and first output of a field in one pass, one point per invocation:
 //   z = [x, e(x)],  u = W₁z + b₁,  h = σ(u),  out = w₂·h + b₂.
 // The SDF and its taps, the proposal densities and the background density are all this kernel (METHOD 2.3, 2.4, 2.8).
+// In two launches, PART 1 with a slice per level and then PART 2, it suits devices whose caches hold one level but not all of them.
 #include "lib/prelude.glsl"
 #include "lib/hash_grid.glsl"
 #include "lib/field.glsl"
+
+layout(constant_id = 7) const uint PART = 0;  // 0 everything, 1 the encoding of one level per slice, 2 the network
 
 layout(push_constant, scalar) uniform Args {
     Levels levels;
@@ -25,23 +28,26 @@ void main() {
     uint point = item();
     if (point >= n) return;
     vec3 x = vec3(points.at[point], points.at[n + point], points.at[2u * n + point]);
-    if (COORDINATES != 0u) {
-        inputs.at[point] = x.x;
-        inputs.at[n + point] = x.y;
-        inputs.at[2u * n + point] = x.z;
-    }
-    for (uint l = 0u; l < LEVELS; ++l) {
-        Level level = levels.at[l];
-        Cell cell = cell_of(level, x);
-        float feature[FEATURES];
-        [[unroll]] for (uint f = 0u; f < FEATURES; ++f) feature[f] = 0.0;
-        [[unroll]] for (uint corner = 0u; corner < 8u; ++corner) {
-            uint entry = corner_entry(level, cell, corner) * FEATURES;
-            float weight = corner_weight(cell, corner);
-            [[unroll]] for (uint f = 0u; f < FEATURES; ++f) feature[f] = fma(weight, table.at[entry + f], feature[f]);
+    if (PART != 2u) {
+        uint first_level = PART == 1u ? level_of_slice(LEVELS) : 0u;
+        uint end_level = PART == 1u ? first_level + 1u : LEVELS;
+        if (COORDINATES != 0u && first_level == 0u) {
+            [[unroll]] for (uint c = 0u; c < 3u; ++c) inputs.at[c * n + point] = x[c];
         }
-        [[unroll]] for (uint f = 0u; f < FEATURES; ++f) inputs.at[(COORDINATES + l * FEATURES + f) * n + point] = feature[f];
+        for (uint l = first_level; l < end_level; ++l) {
+            Level level = levels.at[l];
+            Cell cell = cell_of(level, x);
+            float feature[FEATURES];
+            [[unroll]] for (uint f = 0u; f < FEATURES; ++f) feature[f] = 0.0;
+            [[unroll]] for (uint corner = 0u; corner < 8u; ++corner) {
+                uint entry = corner_entry(level, cell, corner) * FEATURES;
+                float weight = corner_weight(cell, corner);
+                [[unroll]] for (uint f = 0u; f < FEATURES; ++f) feature[f] = fma(weight, table.at[entry + f], feature[f]);
+            }
+            [[unroll]] for (uint f = 0u; f < FEATURES; ++f) inputs.at[(COORDINATES + l * FEATURES + f) * n + point] = feature[f];
+        }
     }
+    if (PART == 1u) return;
     float z[INPUTS];
     [[unroll]] for (uint i = 0u; i < INPUTS; ++i) z[i] = inputs.at[i * n + point];
 

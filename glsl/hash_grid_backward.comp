@@ -1,7 +1,6 @@
 #version 460
 // Scatter of ∂loss/∂features into the hash table: d_table[corner] += weight · d_e, one (point, level) per invocation.
-// The level is the grid's slice: only one level's gradients need to fit the cache, and devices that split a grid into contiguous
-// parts never let two cores meet in one level. Slices take levels from both ends in turn, so that such parts cost the same.
+// The level is the launch's slice: only one level's gradients need to fit the cache.
 #include "lib/prelude.glsl"
 #include "lib/hash_grid.glsl"
 
@@ -19,7 +18,7 @@ layout(push_constant, scalar) uniform Args {
 void main() {
     uint point = item();
     if (point >= n) return;
-    uint l = (slice() & 1u) == 0u ? slice() >> 1u : LEVELS - 1u - (slice() >> 1u);
+    uint l = slice();
     Level level = levels.at[l];
     Cell cell = cell_of(level, vec3(points.at[point], points.at[n + point], points.at[2u * n + point]));
     float d_e[FEATURES];

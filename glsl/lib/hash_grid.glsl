@@ -12,6 +12,13 @@ struct Level {
 };
 layout(buffer_reference, scalar) readonly buffer Levels { Level at[]; };
 
+// The level that a slice of a launch works on: from both ends in turn. Devices whose few cores take contiguous parts of a launch then find
+// as many coarse levels, which are quick, as fine ones in each part.
+uint level_of_slice(uint n_levels) {
+    uint half_ = slice() >> 1u;
+    return (slice() & 1u) == 0u ? half_ : n_levels - 1u - half_;
+}
+
 struct Cell {
     uvec3 low;    // the corner nearest to -infinity
     vec3 weight;  // position inside the cell, in [0, 1)
@@ -24,12 +31,15 @@ Cell cell_of(Level level, vec3 x) {
     return Cell(uvec3(ivec3(low)), fma(vec3(half_scale), x, half_scale - low) + 0.5);
 }
 
+const uvec3 HASH_PRIMES = uvec3(1u, 2654435761u, 805459861u);
+
 // Entry (within the whole table) of corner 0..7 of a cell; bit 0, 1, 2 of `corner` steps along x, y, z.
 uint corner_entry(Level level, Cell cell, uint corner) {
     uvec3 at = cell.low + uvec3(corner & 1u, (corner >> 1u) & 1u, corner >> 2u);
     uint index;
     if (level.hashed != 0u) {
-        index = (at.x ^ (at.y * 2654435761u) ^ (at.z * 805459861u)) & (level.entries - 1u);
+        uvec3 h = at * HASH_PRIMES;
+        index = (h.x ^ h.y ^ h.z) & (level.entries - 1u);
     } else {
         index = at.x + level.resolution * (at.y + level.resolution * at.z);
         if (index >= level.entries) index %= level.entries;
@@ -41,4 +51,13 @@ float corner_weight(Cell cell, uint corner) {
     vec3 far = vec3(float(corner & 1u), float((corner >> 1u) & 1u), float(corner >> 2u));
     vec3 w = mix(1.0 - cell.weight, cell.weight, far);
     return w.x * w.y * w.z;
+}
+
+// Whether two corners of a cell may share an entry. A corner's hash differs from corner 0's by the exclusive or of what its steps along
+// x, y and z change; those three numbers are odd, since the primes are, so corners meet only where two of the three are equal. In a
+// dense level they meet nowhere, except that positions outside the cube may wrap onto anything.
+bool corners_may_meet(Level level, Cell cell) {
+    uvec3 change = ((cell.low * HASH_PRIMES) ^ ((cell.low + 1u) * HASH_PRIMES)) & (level.entries - 1u);
+    if (level.hashed != 0u) return change.x == change.y || change.x == change.z || change.y == change.z;
+    return any(greaterThanEqual(cell.low, uvec3(level.resolution)));
 }

@@ -54,6 +54,9 @@ pub struct DeviceInfo {
     pub max_workgroup: u32,
     /// Whether floats in memory can be added to atomically; otherwise a compare-and-swap loop does it.
     pub float_atomics: bool,
+    /// Whether a handful of cores do all the work, as on software devices: kernels then keep them apart where a GPU's invocations would
+    /// meet in memory, and go through memory in pieces that fit a core's cache.
+    pub few_cores: bool,
     /// What this device lacks to run the kernels; empty where it can.
     pub missing: Vec<String>,
     pub(super) int64: bool,
@@ -224,6 +227,7 @@ impl Instance {
             shared_memory: first.limits.max_compute_shared_memory_size,
             max_workgroup: first.limits.max_compute_work_group_invocations,
             float_atomics: false,
+            few_cores: false,
             missing: Vec::new(),
             int64: false,
             timestamp_period: 0.0,
@@ -298,6 +302,8 @@ impl Instance {
         };
         info.subgroup_size = subgroups.subgroup_size;
         info.float_atomics = atomics.shader_buffer_float32_atomic_add != 0;
+        // hash_grid_backward_owned counts on eight lanes of one subgroup.
+        info.few_cores = info.kind == DeviceKind::Cpu && info.subgroup_size >= 8;
         info.timestamp_period = limits.timestamp_period as f64;
         if control.compute_full_subgroups != 0
             && sizes

@@ -5,7 +5,9 @@ use super::layer::{Activation, Layer, LayerShape};
 use super::params::{Params, WeightHandle};
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, Kernel, Ptr, PtrMut, Recorder, Work};
-use crate::kernels::{Level, field_backward, field_forward, hash_grid_backward};
+use crate::kernels::{
+    Level, field_backward, field_forward, hash_grid_backward, hash_grid_backward_owned,
+};
 
 /// What fixes a field's kernels.
 #[derive(Clone, Copy, Debug)]
@@ -32,10 +34,24 @@ pub struct Field {
     hidden: WeightHandle,
     heads: WeightHandle,
     levels: Buffer<Level>,
-    forward: Kernel<field_forward::Args>,
+    forward: Forward,
     backward: Kernel<field_backward::Args>,
-    scatter: Kernel<hash_grid_backward::Args>,
+    scatter: Scatter,
     hidden_gradient: Layer,
+}
+
+/// How the device evaluates a field.
+enum Forward {
+    Fused(Kernel<field_forward::Args>),
+    /// For devices whose caches hold one level of the table but not all: level by level, then the network.
+    Parts(Kernel<field_forward::Args>, Kernel<field_forward::Args>),
+}
+
+/// How the device adds up the table's gradient.
+enum Scatter {
+    Atomic(Kernel<hash_grid_backward::Args>),
+    /// For devices with few cores and slow atomics: a core for each level.
+    Owned(Kernel<hash_grid_backward_owned::Args>),
 }
 
 /// What one evaluation of a field over `n` points leaves for its backward pass.
@@ -114,6 +130,7 @@ impl Field {
             softplus,
             bias,
             tile,
+            part: 0,
         };
         let backward = field_backward::Shape {
             levels: grid_levels,
@@ -132,19 +149,40 @@ impl Field {
             backward_inputs: 0,
             inputs_are_relu: false,
         };
+        let few_cores = gpu.info().few_cores;
+        let forward_part = |part, name: &str| -> Result<_> {
+            let shape = field_forward::Shape { part, ..forward };
+            Ok(gpu.kernel(shape)?.labelled(name))
+        };
         Ok(Field {
             table,
             hidden,
             heads,
             levels,
-            forward: gpu.kernel(forward)?.labelled(label),
+            forward: match few_cores {
+                true => Forward::Parts(
+                    forward_part(1, &format!("{label} encoding"))?,
+                    forward_part(2, &format!("{label} network"))?,
+                ),
+                false => Forward::Fused(forward_part(0, label)?),
+            },
             backward: gpu.kernel(backward)?.labelled(label),
-            scatter: gpu
-                .kernel(hash_grid_backward::Shape {
-                    levels: grid_levels,
-                    features,
-                })?
-                .labelled(label),
+            scatter: match few_cores {
+                true => {
+                    let shape = hash_grid_backward_owned::Shape {
+                        levels: grid_levels,
+                        features,
+                    };
+                    Scatter::Owned(gpu.kernel(shape)?.labelled(label))
+                }
+                false => {
+                    let shape = hash_grid_backward::Shape {
+                        levels: grid_levels,
+                        features,
+                    };
+                    Scatter::Atomic(gpu.kernel(shape)?.labelled(label))
+                }
+            },
             hidden_gradient: Layer::new(gpu, &format!("{label} hidden"), gradient, hidden)?,
             shape,
         })
@@ -152,6 +190,10 @@ impl Field {
 
     fn gather_bytes(&self) -> f64 {
         32.0 * f64::from(self.shape.grid.outputs())
+    }
+
+    fn interpolation_flops(&self) -> f64 {
+        16.0 * f64::from(self.shape.grid.outputs())
     }
 
     fn hidden_flops(&self) -> f64 {
@@ -182,13 +224,23 @@ impl Field {
             n,
             n_hidden: buffers.n_hidden,
         };
-        let flops = self.hidden_flops() + 2.0 * 8.0 * f64::from(self.shape.grid.outputs());
-        let bytes = self.gather_bytes() + 8.0 * f64::from(self.shape.inputs());
-        rec.run(
-            &self.forward,
-            Work::items(u64::from(n)).flops(flops).bytes(bytes),
-            args,
-        );
+        let work = Work::items(u64::from(n));
+        let (interpolation, network) = (self.interpolation_flops(), self.hidden_flops());
+        let (gather, rows) = (self.gather_bytes(), 4.0 * f64::from(self.shape.inputs()));
+        match &self.forward {
+            Forward::Fused(kernel) => {
+                let work = work.flops(interpolation + network);
+                rec.run(kernel, work.bytes(gather + 2.0 * rows), args);
+            }
+            Forward::Parts(encoding, head) => {
+                let levels = f64::from(self.shape.grid.levels);
+                let by_level = work
+                    .slices(self.shape.grid.levels)
+                    .flops(interpolation / levels);
+                rec.run(encoding, by_level.bytes((gather + rows) / levels), args);
+                rec.run(head, work.flops(network).bytes(rows), args);
+            }
+        }
     }
 
     /// Adds all parameter gradients, from `d_first [n]` and, for the leading points, the heads' `buffers.d_hidden`.
@@ -233,17 +285,39 @@ impl Field {
             scratch.d_preactivation.ptr(),
             n,
         );
-        let args = hash_grid_backward::Args {
-            levels: self.levels.ptr(),
-            points,
-            d_features: scratch.d_features.ptr(),
-            d_table: params.grads().ptr_mut().offset(self.table),
-            n,
-        };
-        let levels = self.shape.grid.levels;
-        let work = Work::items(u64::from(n))
-            .slices(levels)
-            .flops(2.0 * 8.0 * f64::from(self.shape.grid.outputs()));
-        rec.run(&self.scatter, work.bytes(2.0 * self.gather_bytes()), args);
+        let d_table = params.grads().ptr_mut().offset(self.table);
+        let (levels, d_features) = (self.levels.ptr(), scratch.d_features.ptr());
+        let slices = self.shape.grid.levels;
+        let flops = self.interpolation_flops() / f64::from(slices);
+        let bytes = 2.0 * self.gather_bytes() / f64::from(slices);
+        match &self.scatter {
+            Scatter::Atomic(kernel) => {
+                let args = hash_grid_backward::Args {
+                    levels,
+                    points,
+                    d_features,
+                    d_table,
+                    n,
+                };
+                let work = Work::items(u64::from(n)).slices(slices);
+                rec.run(kernel, work.flops(flops).bytes(bytes), args);
+            }
+            Scatter::Owned(kernel) => {
+                let args = hash_grid_backward_owned::Args {
+                    levels,
+                    points,
+                    d_features,
+                    d_table,
+                    n,
+                };
+                let work = Work::groups(1).slices(slices);
+                let points = f64::from(n);
+                rec.run(
+                    kernel,
+                    work.flops(flops * points).bytes(bytes * points),
+                    args,
+                );
+            }
+        }
     }
 }

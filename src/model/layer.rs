@@ -38,8 +38,9 @@ pub struct LayerShape {
     pub inputs_are_relu: bool,
 }
 
-/// Samples that one workgroup of the weight gradient sums up.
-const GRADIENT_CHUNK: u32 = 8192;
+/// Samples that one workgroup of the weight gradient sums up, and inputs that one of its invocations has.
+const GRADIENT_CHUNK: u32 = 1024;
+const GRADIENT_TILE: u32 = 32;
 
 impl Layer {
     /// Builds the layer's kernels; `label` names their rows in the profile.
@@ -85,6 +86,7 @@ impl Layer {
                     inputs: shape.inputs,
                     outputs: shape.outputs,
                     bias,
+                    tile: shape.inputs.min(GRADIENT_TILE),
                 })?
                 .labelled(label),
         })
@@ -100,10 +102,12 @@ impl Layer {
     }
 
     fn work(&self, n: u32, outputs: u32) -> Work {
+        let slices = outputs.div_ceil(tile(outputs));
+        let connections = f64::from(self.inputs) * f64::from(self.outputs);
         Work::items(u64::from(n))
-            .slices(outputs.div_ceil(tile(outputs)))
-            .flops(2.0 * f64::from(self.inputs) * f64::from(self.outputs))
-            .bytes(4.0 * f64::from(self.inputs + self.outputs))
+            .slices(slices)
+            .flops(2.0 * connections / f64::from(slices))
+            .bytes(4.0 * f64::from(self.inputs + self.outputs) / f64::from(slices))
     }
 
     /// `y [outputs, n]` from `x [inputs, n]`.
@@ -170,15 +174,17 @@ impl Layer {
             stride_x,
             chunk: GRADIENT_CHUNK,
         };
-        let columns = self.inputs + u32::from(self.handle.bias.is_some());
-        let groups = u64::from(n.div_ceil(GRADIENT_CHUNK));
-        let work = Work::items(groups * 64)
-            .slices(columns.div_ceil(8) * self.outputs.div_ceil(8))
+        let lanes = self.gradient.local_size();
+        let tiles = self.inputs.div_ceil(GRADIENT_TILE);
+        let samples = f64::from(n.min(GRADIENT_CHUNK));
+        let work = Work::groups(u64::from(n.div_ceil(GRADIENT_CHUNK)))
+            .slices(tiles * self.outputs.div_ceil(lanes))
             .flops(
-                2.0 * f64::from(columns) * f64::from(self.outputs) * f64::from(GRADIENT_CHUNK)
-                    / 64.0,
+                2.0 * f64::from(GRADIENT_TILE.min(self.inputs) * lanes.min(self.outputs)) * samples,
             )
-            .bytes(4.0 * f64::from(columns + self.outputs) * f64::from(GRADIENT_CHUNK) / 64.0);
+            .bytes(
+                4.0 * f64::from(GRADIENT_TILE.min(self.inputs) + lanes.min(self.outputs)) * samples,
+            );
         rec.run(&self.gradient, work, args);
     }
 }
