@@ -22,7 +22,7 @@ fn published_step() -> Result<()> {
     let mut config = Config::preset("outdoor-tiny")?;
     config.rays = published.rays.origins.len() as u32;
     config.loss.bias.reduction = BiasReduction::Published;
-    let rig = Rig::new(config, RegionShape::Sphere)?;
+    let rig = Rig::new(config, RegionShape::Sphere, false)?;
     assert_eq!(rig.twin.samples, published.config.samples);
     assert_eq!(rig.twin.proposal_samples, published.config.proposal_samples);
 

@@ -25,7 +25,8 @@ pub struct Rig {
 
 impl Rig {
     /// A trainer on a few small pictures of the built-in scene, under the validation layer, with guard words and poisoned scratch.
-    pub fn new(config: Config, shape: RegionShape) -> Result<Rig> {
+    /// `portable`: by the kernels that run everywhere, also where this device has faster ones.
+    pub fn new(config: Config, shape: RegionShape, portable: bool) -> Result<Rig> {
         let folder = tempfile::tempdir().expect("a temporary folder");
         let root = folder.path().join("scene");
         let pictures = SyntheticOptions {
@@ -47,6 +48,7 @@ impl Rig {
         let gpu = Gpu::new(&GpuOptions {
             guard: true,
             validation: true,
+            portable,
             ..GpuOptions::default()
         })?;
         let trainer = Trainer::new(&gpu, &scene, &region, &config)?;

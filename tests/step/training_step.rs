@@ -30,7 +30,12 @@ fn preset(name: &str) -> Config {
 
 #[test]
 fn outdoors_with_one_background_color() -> Result<()> {
-    check(preset("outdoor-tiny"), RegionShape::Sphere, 9)
+    check(preset("outdoor-tiny"), RegionShape::Sphere, 9, false)
+}
+
+#[test]
+fn by_the_portable_kernels() -> Result<()> {
+    check(preset("outdoor-tiny"), RegionShape::Sphere, 9, true)
 }
 
 #[test]
@@ -39,7 +44,7 @@ fn indoors_in_a_box_with_the_published_bias_loss() -> Result<()> {
     config.rays = 100;
     config.loss.bias.reduction = BiasReduction::Published;
     let half = dvec3(1.0, 0.8, 0.9);
-    check(config, RegionShape::Box { half }, 9)
+    check(config, RegionShape::Box { half }, 9, false)
 }
 
 #[test]
@@ -51,7 +56,7 @@ fn outdoors_with_a_background_field_and_appearance_codes() -> Result<()> {
     config.hash.log2_size = 14;
     config.background.samples = 12;
     config.background.max = 128;
-    check(config, RegionShape::Sphere, 9)
+    check(config, RegionShape::Sphere, 9, false)
 }
 
 #[test]
@@ -62,11 +67,11 @@ fn with_the_widths_of_the_large_configurations() -> Result<()> {
     config.sampling.proposal_log2_size = 12;
     config.sampling.proposal_samples = [64, 48];
     config.background.log2_size = 12;
-    check(config, RegionShape::Sphere, 9)
+    check(config, RegionShape::Sphere, 9, false)
 }
 
-fn check(config: Config, shape: RegionShape, seed: u64) -> Result<()> {
-    let mut rig = Rig::new(config, shape)?;
+fn check(config: Config, shape: RegionShape, seed: u64, portable: bool) -> Result<()> {
+    let mut rig = Rig::new(config, shape, portable)?;
     for _ in 0..STEP {
         rig.trainer.step()?;
     }
