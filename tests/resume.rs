@@ -6,6 +6,8 @@ use neurodin::gpu::{Gpu, GpuOptions};
 use neurodin::scene::{Region, RegionShape, Scene, SceneOptions};
 use neurodin::train::Trainer;
 use neurodin::train::checkpoint::Checkpoint;
+use neurodin::train::report::{Control, Event};
+use neurodin::train::run_directory::RunDirectory;
 use std::fs;
 use std::path::Path;
 
@@ -87,6 +89,82 @@ fn a_restored_run_takes_the_same_next_step() {
         first.values.iter().all(|value| value.is_finite()),
         "{first:?}"
     );
+}
+
+#[test]
+fn losses_that_are_not_finite_lead_back_to_the_last_checkpoint() {
+    let folder = tempfile::tempdir().unwrap();
+    let scene = scene(folder.path());
+    let region = Region {
+        center: DVec3::ZERO,
+        radius: 1.1,
+        shape: RegionShape::Sphere,
+        how: "stated".into(),
+    };
+    let settings = "steps = 30\nrays = 16\nhash.levels = 4\nhash.log2_size = 10\nreport.preview_steps = 0\nreport.checkpoint_steps = 5";
+    let config = Config::preset("outdoor-tiny")
+        .and_then(|config| config.with_toml(settings, "test"))
+        .unwrap();
+    let gpu = Gpu::new(&GpuOptions::default()).unwrap();
+    let trained = |steps: u64| {
+        let mut trainer = Trainer::new(&gpu, &scene, &region, &config).unwrap();
+        for _ in 0..steps {
+            trainer.step().unwrap();
+        }
+        trainer.finish().unwrap();
+        trainer
+    };
+    let poison = |trainer: &Trainer| {
+        let params = &trainer.model().params;
+        let mut spans = params.spans().iter();
+        let bias = spans
+            .find(|span| span.name == "surface.heads.bias")
+            .unwrap();
+        gpu.upload(params.values(), bias.first, &[f32::NAN])
+            .unwrap();
+    };
+    let run = RunDirectory::create(&folder.path().join("run"), false).unwrap();
+    let mut trainer = trained(3);
+    trainer.save(&run.checkpoints()).unwrap();
+    poison(&trainer);
+    let mut warnings = Vec::new();
+    let mut tell = |event: Event| {
+        if let Event::Warning { what, .. } = event {
+            warnings.push(what);
+        }
+        Control::Continue
+    };
+    trainer.run(&scene, &run, &mut tell).unwrap();
+    assert_eq!(trainer.steps_done(), 30);
+    let losses = trainer.finish().unwrap().unwrap();
+    assert!(
+        losses.values.iter().all(|value| value.is_finite()),
+        "{losses:?}"
+    );
+    assert_eq!(warnings.len(), 1, "{warnings:?}");
+    assert!(
+        warnings[0].contains("checkpoint of step 3 "),
+        "{warnings:?}"
+    );
+    let last = neurodin::train::checkpoint::latest(&run.checkpoints()).unwrap();
+    let mut again = trained(0);
+    again.restore(&last.checkpoint).unwrap();
+    let saved = again.save(&folder.path().join("again")).unwrap();
+    assert!(
+        fs::read(saved).unwrap() == fs::read(last.checkpoint.path()).unwrap(),
+        "the smaller learning rates are part of the state"
+    );
+
+    // Without a checkpoint there is nothing to go back to.
+    let run = RunDirectory::create(&folder.path().join("empty"), false).unwrap();
+    let mut trainer = trained(1);
+    poison(&trainer);
+    let error = trainer
+        .run(&scene, &run, &mut |_| Control::Continue)
+        .unwrap_err();
+    assert_eq!(error.exit_code(), 7);
+    let text = error.to_string();
+    assert!(text.contains("not been finite for 10 steps"), "{text}");
 }
 
 #[test]

@@ -1,5 +1,6 @@
 //! What a ray sees behind the region: nothing, one learned colour, or a learned radiance field (METHOD 2.8).
 
+use super::appearance::add_codes;
 use super::field::{Field, FieldBuffers, FieldShape, Scratch};
 use super::hash_grid::HashGrid;
 use super::layer::{Activation, Layer, LayerShape};
@@ -261,15 +262,13 @@ impl Radiance {
             };
             colors.push(Layer::new(gpu, &name, layer_shape, handle)?);
         }
-        let mut draws = Draws::new(config.seed, "background appearance");
-        let codes = (0..views * appearance_dims)
-            .map(|_| draws.normal(0.0, 1.0))
-            .collect();
-        let appearance = plan.add(
+        let appearance = add_codes(
+            plan,
             group,
             "background.appearance",
-            &[u64::from(views), u64::from(appearance_dims)],
-            Init::Values(codes),
+            config.seed,
+            views,
+            appearance_dims,
         );
         let head_shape = LayerShape {
             inputs: hidden,

@@ -1,5 +1,6 @@
 //! The learned functions and their parameters: what a point, a ray or an image is mapped to. Knows nothing of steps.
 
+mod appearance;
 mod background;
 mod field;
 mod hash_grid;
@@ -34,11 +35,11 @@ impl Model {
     /// Builds and initialises the model of a configuration for `n_views` training views under a sky of this colour.
     pub fn new(gpu: &Gpu, config: &Config, n_views: u32, sky: [f32; 3]) -> Result<Model> {
         let mut plan = ParamsPlan::default();
-        let surface = Surface::new(gpu, config, &mut plan, n_views + 1)?;
+        let surface = Surface::new(gpu, config, &mut plan, n_views)?;
         let proposals = (0..2)
             .map(|level| Proposal::new(gpu, config, &mut plan, level))
             .collect::<Result<_>>()?;
-        let background = Background::new(gpu, config, &mut plan, n_views + 1, sky)?;
+        let background = Background::new(gpu, config, &mut plan, n_views, sky)?;
         Ok(Model {
             params: plan.build(gpu, config.seed)?,
             surface,
@@ -46,5 +47,13 @@ impl Model {
             background,
             n_views,
         })
+    }
+
+    /// Sets the appearance code that evaluation uses: zero, which it is at first, or the mean of the views' codes.
+    ///
+    /// # Errors
+    /// What the device fails with.
+    pub fn set_evaluation_code(&self, gpu: &Gpu, mean: bool) -> Result<()> {
+        appearance::set_evaluation_code(gpu, &self.params, mean)
     }
 }

@@ -1,5 +1,6 @@
 //! The surface: SDF, local scale, geometry features and the colour network (METHOD 2.4, 2.5, 2.7).
 
+use super::appearance::add_codes;
 use super::field::{Field, FieldBuffers, FieldShape, Scratch};
 use super::hash_grid::HashGrid;
 use super::layer::{Activation, Layer, LayerShape};
@@ -72,7 +73,7 @@ impl Surface {
         }
     }
 
-    /// Adds the parameters with NeuRodin's geometric initialisation and builds the kernels. `views` counts appearance codes.
+    /// Adds the parameters with NeuRodin's geometric initialisation and builds the kernels. `views` counts the training views.
     pub fn new(gpu: &Gpu, config: &Config, plan: &mut ParamsPlan, views: u32) -> Result<Surface> {
         let shape = Self::field_shape(config);
         let (hidden, inputs) = (shape.hidden, shape.inputs());
@@ -146,15 +147,13 @@ impl Surface {
             };
             colors.push(Layer::new(gpu, &name, shape, handle)?);
         }
-        let mut draws = Draws::new(config.seed, "appearance");
-        let codes = (0..views * appearance_dims)
-            .map(|_| draws.normal(0.0, 1.0))
-            .collect();
-        let appearance = plan.add(
+        let appearance = add_codes(
+            plan,
             Group::Fields,
             "appearance",
-            &[u64::from(views), u64::from(appearance_dims)],
-            Init::Values(codes),
+            config.seed,
+            views,
+            appearance_dims,
         );
         let entries = shape.grid.entries();
         let table = plan.add(

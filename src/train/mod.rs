@@ -36,6 +36,8 @@ pub struct Trainer {
     /// What a preview shows; the last row of the device's table.
     preview: Option<run::PreviewView>,
     step: u64,
+    /// On all learning rates: 1, or less once losses were not finite.
+    rate_factor: f64,
     /// Losses of the last steps, [LOSS_HISTORY, TERMS + 1], read without waiting.
     history: Readback<f32>,
     tickets: std::collections::VecDeque<(u64, Ticket)>,
@@ -126,6 +128,7 @@ impl Trainer {
             region: region.clone(),
             preview,
             step: 0,
+            rate_factor: 1.0,
             model,
             renderer,
             loss,
@@ -135,7 +138,10 @@ impl Trainer {
 
     /// One optimiser step: a batch of pixels in, better parameters out. Returns once the work is handed to the device.
     pub fn step(&mut self) -> Result<()> {
-        let now = self.schedule.at(self.step);
+        let now = self
+            .schedule
+            .at(self.step)
+            .with_rates_times(self.rate_factor);
         let ticket = self.gpu.submit("step", |rec| {
             self.renderer.draws.fill(rec, self.step, TRAINING);
             self.renderer
@@ -248,7 +254,8 @@ impl Trainer {
         StepLosses { step, values }
     }
 
-    /// Renders view `view` of the scene at its picture's size, at the current step.
+    /// Renders view `view` of the scene at its picture's size, at the current step; other views than those trained with by the appearance
+    /// code zero, since the mean of the others is taken when training is over ([`trained`]).
     pub fn render(
         &self,
         view: usize,

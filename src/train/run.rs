@@ -16,8 +16,13 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-/// After so many steps in a row without finite losses, none of which changed the parameters, training gives up.
+/// After so many steps in a row without finite losses, none of which changed the parameters, training goes back to its last checkpoint,
+/// once, with this factor on all learning rates; the second time it gives up.
 const BAD_STEPS: u32 = 10;
+const SLOWED: f64 = 0.5;
+
+/// Key of that factor in a checkpoint's extra state.
+const RATE_FACTOR: &str = "learning_rate_factor";
 
 impl Trainer {
     /// Trains from where this stands to the end of the configuration's steps, writing previews and checkpoints into `run`.
@@ -64,7 +69,12 @@ impl Trainer {
             let mut stopping = tell(Event::Advanced { step, steps });
             let losses = self.losses()?;
             if let Some(losses) = &losses {
-                bad.watch(losses, run)?;
+                if bad.watch(losses) {
+                    let what = self.go_back(run, losses)?;
+                    tell(Event::Warning { step, what });
+                    (pace, bad) = (Pace::default(), BadSteps::default());
+                    continue;
+                }
                 if step.is_multiple_of(report.log_steps) {
                     pace.mark(step);
                     stopping |= tell(told(losses, steps, pace.per_second()));
@@ -95,11 +105,15 @@ impl Trainer {
                 && saved.1.elapsed().as_secs_f64() >= 60.0 * report.checkpoint_minutes;
             if stopping || last || overdue || due(step, report.checkpoint_steps, false) {
                 if let Some(losses) = self.finish()? {
-                    bad.watch(&losses, run)?;
+                    bad.watch(&losses);
                     if last && !step.is_multiple_of(report.log_steps) {
                         pace.mark(step);
                         tell(told(&losses, steps, pace.per_second()));
                     }
+                }
+                // What made the losses bad may be in the parameters: the last checkpoint from before it must stay the newest.
+                if bad.count > 0 && !stopping && !last {
+                    continue;
                 }
                 let begun = Instant::now();
                 let path = self.save(&run.checkpoints())?;
@@ -128,6 +142,45 @@ impl Trainer {
         Ok(())
     }
 
+    /// Takes back the newest checkpoint after losses that were not finite, and says so; fails where that has been done before.
+    fn go_back(&mut self, run: &RunDirectory, losses: &StepLosses) -> Result<String> {
+        let step = losses.step;
+        let terms: Vec<String> = TERMS
+            .iter()
+            .zip(&losses.values)
+            .map(|(name, value)| format!("{name} {value}"))
+            .collect();
+        let happened = format!(
+            "the loss has not been finite for {BAD_STEPS} steps, up to step {step} ({})",
+            terms.join(", ")
+        );
+        let newest = checkpoint::latest(&run.checkpoints()).ok();
+        match newest {
+            Some(newest) if self.rate_factor == 1.0 => {
+                self.restore(&newest.checkpoint)?;
+                self.rate_factor = SLOWED;
+                Ok(format!(
+                    "{happened}: going on from the checkpoint of step {} with learning rates times {SLOWED}",
+                    self.step
+                ))
+            }
+            newest => {
+                let next = match newest {
+                    Some(newest) => format!(
+                        "the checkpoint of step {} is intact: --resume it with smaller learning rates",
+                        newest.checkpoint.state().step
+                    ),
+                    None => "begin again with smaller learning rates".into(),
+                };
+                Err(Error::Numerical {
+                    what: format!(
+                        "{happened}\n  next: {next} (optimizer.*.learning_rate), and look at the dataset and its region with `neurodin inspect`"
+                    ),
+                })
+            }
+        }
+    }
+
     /// Writes a checkpoint of everything that later steps depend on into `folder`; see [`checkpoint::save`].
     ///
     /// # Errors
@@ -138,7 +191,7 @@ impl Trainer {
             step: self.step,
             config: self.config.clone(),
             region: self.region.clone(),
-            extra: BTreeMap::new(),
+            extra: BTreeMap::from([(RATE_FACTOR.into(), self.rate_factor.to_string())]),
         };
         let parts = self.parts();
         let tensors: Vec<Tensor> = parts.iter().map(|(tensor, ..)| tensor.clone()).collect();
@@ -178,6 +231,8 @@ impl Trainer {
         }
         self.gpu.finish()?;
         self.step = state.step;
+        let factor = state.extra.get(RATE_FACTOR);
+        self.rate_factor = factor.and_then(|text| text.parse().ok()).unwrap_or(1.0);
         self.tickets.clear();
         Ok(())
     }
@@ -339,37 +394,15 @@ struct BadSteps {
 }
 
 impl BadSteps {
-    fn watch(&mut self, losses: &StepLosses, run: &RunDirectory) -> Result<()> {
-        if self.last == Some(losses.step) {
-            return Ok(());
+    /// Whether these losses are the last of too many.
+    fn watch(&mut self, losses: &StepLosses) -> bool {
+        if self.last != Some(losses.step) {
+            self.last = Some(losses.step);
+            self.count = match losses.values[TERMS.len()].is_finite() {
+                true => 0,
+                false => self.count + 1,
+            };
         }
-        self.last = Some(losses.step);
-        let total = losses.values[TERMS.len()];
-        if total.is_finite() {
-            self.count = 0;
-            return Ok(());
-        }
-        self.count += 1;
-        if self.count < BAD_STEPS {
-            return Ok(());
-        }
-        let terms: Vec<String> = TERMS
-            .iter()
-            .zip(&losses.values)
-            .map(|(name, value)| format!("{name} {value}"))
-            .collect();
-        let next = match checkpoint::files(&run.checkpoints())?.last() {
-            Some((step, _)) => format!(
-                "the checkpoint of step {step} is intact: --resume it with smaller learning rates"
-            ),
-            None => "begin again with smaller learning rates".into(),
-        };
-        Err(Error::Numerical {
-            what: format!(
-                "the loss has not been finite for {BAD_STEPS} steps, up to step {} ({})\n  next: {next} (optimizer.*.learning_rate), and look at the dataset and its region with `neurodin inspect`",
-                losses.step,
-                terms.join(", ")
-            ),
-        })
+        self.count >= BAD_STEPS
     }
 }

@@ -37,6 +37,19 @@ pub struct Now {
     pub bias_weight: f64,
 }
 
+impl Now {
+    /// The same with all learning rates multiplied.
+    pub fn with_rates_times(self, factor: f64) -> Now {
+        Now {
+            lr_fields: factor * self.lr_fields,
+            lr_table: factor * self.lr_table,
+            lr_proposal: factor * self.lr_proposal,
+            lr_background: factor * self.lr_background,
+            ..self
+        }
+    }
+}
+
 impl Schedule {
     /// The schedules of a configuration.
     pub fn new(config: &Config) -> Schedule {

@@ -69,6 +69,8 @@ impl Trained {
     /// # Errors
     /// What the device fails with.
     pub fn viewer<'t>(&'t self, scene: &Scene) -> Result<Viewer<'t>> {
+        let mean = self.config.appearance.at_eval == AppearanceAtEval::Mean;
+        self.model.set_evaluation_code(&self.gpu, mean)?;
         let cameras: Vec<_> = scene
             .views
             .iter()

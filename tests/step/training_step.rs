@@ -70,6 +70,28 @@ fn with_the_widths_of_the_large_configurations() -> Result<()> {
     check(config, RegionShape::Sphere, 9, false)
 }
 
+#[test]
+fn evaluation_has_an_appearance_code_of_its_own() -> Result<()> {
+    let mut config = preset("outdoor-tiny");
+    config.appearance.dims = 8;
+    let rig = Rig::new(config, RegionShape::Sphere, false)?;
+    let model = rig.trainer.model();
+    let codes = || -> Result<Vec<f64>> {
+        Ok(rig.download_spans(model.params.values())?["appearance"].clone())
+    };
+    let views = model.n_views as usize;
+    let (own, evaluation) = (codes()?, codes()?.split_off(8 * views));
+    assert_eq!(evaluation, [0.0; 8], "zero, as published");
+    model.set_evaluation_code(&rig.gpu, true)?;
+    for (dim, value) in codes()?[8 * views..].iter().enumerate() {
+        let mean = (0..views).map(|view| own[8 * view + dim]).sum::<f64>() / views as f64;
+        assert!((value - mean).abs() < 1e-6 && mean != 0.0, "{value} {mean}");
+    }
+    model.set_evaluation_code(&rig.gpu, false)?;
+    assert_eq!(codes()?[8 * views..], [0.0; 8]);
+    rig.check_device()
+}
+
 fn check(config: Config, shape: RegionShape, seed: u64, portable: bool) -> Result<()> {
     let mut rig = Rig::new(config, shape, portable)?;
     for _ in 0..STEP {
