@@ -16,6 +16,7 @@ use std::collections::BTreeMap;
 use std::fmt::Write;
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::path::{Path, PathBuf};
+use std::process::Command;
 use std::{env, fs};
 
 /// Changes whenever this file changes what it makes of the same GLSL.
@@ -27,6 +28,7 @@ fn main() {
     println!("cargo:rerun-if-changed=glsl");
     println!("cargo:rerun-if-changed=build.rs");
     println!("cargo:rerun-if-changed=src/gpu/reflect.rs");
+    name_commit();
     let out = PathBuf::from(env::var("OUT_DIR").expect("cargo sets OUT_DIR"));
     let glsl =
         PathBuf::from(env::var("CARGO_MANIFEST_DIR").expect("cargo sets CARGO_MANIFEST_DIR"))
@@ -69,6 +71,21 @@ fn main() {
         "/// Every kernel, by name.\npub static ALL: &[&crate::gpu::KernelModule] = &[{modules}];"
     );
     write_if_changed(&out.join("kernels.rs"), text.as_bytes());
+}
+
+/// Tells release builds the commit that they are made from, for --version. Others are spared a new build after every commit.
+fn name_commit() {
+    let log = Path::new(".git/logs/HEAD");
+    if env::var("PROFILE").is_ok_and(|profile| profile == "release") && log.exists() {
+        println!("cargo:rerun-if-changed={}", log.display());
+        let asked = Command::new("git")
+            .args(["rev-parse", "--short", "HEAD"])
+            .output();
+        if let Ok(answer) = asked.map(|output| String::from_utf8_lossy(&output.stdout).into_owned())
+        {
+            println!("cargo:rustc-env=NEURODIN_GIT_HASH={}", answer.trim());
+        }
+    }
 }
 
 /// Compiles one kernel, or takes what an earlier build made of the same text, and returns its module's Rust text.

@@ -27,8 +27,8 @@ pub use output::Context;
 
 /// Version and, where the build knew it, the commit.
 static VERSION: LazyLock<String> = LazyLock::new(|| match option_env!("NEURODIN_GIT_HASH") {
-    Some(hash) => format!("{} ({hash})", env!("CARGO_PKG_VERSION")),
-    None => env!("CARGO_PKG_VERSION").into(),
+    Some(hash) if !hash.is_empty() => format!("{} ({hash})", env!("CARGO_PKG_VERSION")),
+    _ => env!("CARGO_PKG_VERSION").into(),
 });
 
 /// Photographs to triangle meshes with neural surfaces (NeuRodin), on any Vulkan device

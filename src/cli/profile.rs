@@ -10,6 +10,7 @@ use crate::scene::Region;
 use crate::train::Trainer;
 use crate::{Error, Result};
 use clap::Args;
+use cpu_time::ProcessTime;
 use serde_json::{Value, json};
 use std::fmt::Write as _;
 use std::fs::File;
@@ -91,9 +92,13 @@ pub(super) fn run(args: &ProfileArgs, context: &Context) -> anyhow::Result<()> {
     };
     take(&mut trainer, args.warmup)?;
     gpu.reset_profile()?;
-    let begun = Instant::now();
+    let (begun, cpu_begun) = (Instant::now(), ProcessTime::now());
     take(&mut trainer, steps)?;
-    let wall_ms = begun.elapsed().as_secs_f64() * 1e3;
+    let times = Times {
+        steps: steps as f64,
+        wall_ms: begun.elapsed().as_secs_f64() * 1e3,
+        cpu_ms: cpu_begun.elapsed().as_secs_f64() * 1e3,
+    };
     drop(progress);
     let profile = gpu.profile()?;
     if let Some(path) = &args.trace {
@@ -103,14 +108,23 @@ pub(super) fn run(args: &ProfileArgs, context: &Context) -> anyhow::Result<()> {
         "device": gpu.info().name,
         "preset": config.preset,
         "steps": steps,
-        "wall_ms_per_step": wall_ms / steps as f64,
-        "device_ms_per_step": device_ms(&profile) / steps as f64,
-        "coverage": device_ms(&profile) / wall_ms,
+        "wall_ms_per_step": times.wall_ms / times.steps,
+        "cpu_ms_per_step": times.cpu_ms / times.steps,
+        "device_ms_per_step": device_ms(&profile) / times.steps,
+        "coverage": device_ms(&profile) / times.wall_ms,
         "roofs": { "gb_per_s": roofs.copy_gb_s, "gflop_per_s": roofs.fma_gflop_s },
         "rows": profile.rows.iter().map(|row| as_json(row, &profile, &roofs)).collect::<Vec<_>>(),
         "trace": args.trace,
     });
-    Ok(context.result(&result, &as_text(&profile, &roofs, steps, wall_ms))?)
+    Ok(context.result(&result, &as_text(&profile, &roofs, &times))?)
+}
+
+/// What the timed steps took together.
+struct Times {
+    steps: f64,
+    wall_ms: f64,
+    /// Of all threads of this process: on a software device, the price of the steps; on a GPU, that of driving it.
+    cpu_ms: f64,
 }
 
 fn stop_if(interrupted: &AtomicBool) -> Result<()> {
@@ -152,7 +166,7 @@ fn as_json(row: &ProfileRow, profile: &Profile, roofs: &Roofs) -> Value {
     })
 }
 
-fn as_text(profile: &Profile, roofs: &Roofs, steps: u64, wall_ms: f64) -> String {
+fn as_text(profile: &Profile, roofs: &Roofs, times: &Times) -> String {
     let total = device_ms(profile);
     let width = profile
         .rows
@@ -179,12 +193,18 @@ fn as_text(profile: &Profile, roofs: &Roofs, steps: u64, wall_ms: f64) -> String
             giga_per_s(row.flops, row.total_ms),
         );
     }
+    let Times {
+        steps,
+        wall_ms,
+        cpu_ms,
+    } = times;
     let _ = write!(
         text,
-        "{steps} steps: {:.2} ms each on the device, {:.2} ms on the clock ({:.1} % covered); roofs {:.1} GB/s, {:.1} GFLOP/s",
-        total / steps as f64,
-        wall_ms / steps as f64,
+        "{steps} steps: {:.2} ms each on the device, {:.2} ms on the clock ({:.1} % covered), {:.2} ms of CPU time; roofs {:.1} GB/s, {:.1} GFLOP/s",
+        total / steps,
+        wall_ms / steps,
         100.0 * total / wall_ms,
+        cpu_ms / steps,
         roofs.copy_gb_s,
         roofs.fma_gflop_s
     );
