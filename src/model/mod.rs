@@ -33,7 +33,14 @@ pub struct Model {
 
 impl Model {
     /// Builds and initialises the model of a configuration for `n_views` training views under a sky of this colour.
-    pub fn new(gpu: &Gpu, config: &Config, n_views: u32, sky: [f32; 3]) -> Result<Model> {
+    /// `learns`: with gradients and moments, three times the memory of the parameters.
+    pub fn new(
+        gpu: &Gpu,
+        config: &Config,
+        n_views: u32,
+        sky: [f32; 3],
+        learns: bool,
+    ) -> Result<Model> {
         let mut plan = ParamsPlan::default();
         let surface = Surface::new(gpu, config, &mut plan, n_views)?;
         let proposals = (0..2)
@@ -41,7 +48,7 @@ impl Model {
             .collect::<Result<_>>()?;
         let background = Background::new(gpu, config, &mut plan, n_views, sky)?;
         Ok(Model {
-            params: plan.build(gpu, config.seed)?,
+            params: plan.build(gpu, config.seed, learns)?,
             surface,
             proposals,
             background,

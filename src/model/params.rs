@@ -180,8 +180,8 @@ impl ParamsPlan {
         self.len == 0
     }
 
-    /// Allocates the block with its gradients and moments and uploads the initial values.
-    pub fn build(self, gpu: &Gpu, seed: u32) -> Result<Params> {
+    /// Allocates the block, where it `learns` with gradients and moments, and uploads the initial values.
+    pub fn build(self, gpu: &Gpu, seed: u32, learns: bool) -> Result<Params> {
         let values = gpu.buffer::<f32>("params", self.len)?;
         for (span, init) in &self.spans {
             match init {
@@ -193,10 +193,16 @@ impl ParamsPlan {
         }
         let row_table = gpu.buffer::<WeightRow>("weight rows", self.rows.len().max(1) as u64)?;
         gpu.upload(&row_table, 0, &self.rows)?;
+        let learning = match learns {
+            true => Some(Learning {
+                grads: gpu.buffer("gradients", self.len)?,
+                first_moment: gpu.buffer("first moments", self.len)?,
+                second_moment: gpu.buffer("second moments", self.len)?,
+            }),
+            false => None,
+        };
         Ok(Params {
-            grads: gpu.buffer("gradients", self.len)?,
-            first_moment: gpu.buffer("first moments", self.len)?,
-            second_moment: gpu.buffer("second moments", self.len)?,
+            learning,
             effective: gpu.buffer("effective weights", self.effective_len.max(1))?,
             d_effective: gpu.buffer("effective weight gradients", self.effective_len.max(1))?,
             row_table,
@@ -271,15 +277,20 @@ impl Draws {
     }
 }
 
-/// The parameter block on the device.
-pub struct Params {
-    spans: Vec<Span>,
-    values: Buffer<f32>,        // [len]
+/// What a block that learns has beside its values.
+struct Learning {
     grads: Buffer<f32>,         // [len] zero between steps
     first_moment: Buffer<f32>,  // [len]
     second_moment: Buffer<f32>, // [len]
-    effective: Buffer<f32>,     // [effective_len] W of every weight-normalised layer
-    d_effective: Buffer<f32>,   // [effective_len] zero between steps
+}
+
+/// The parameter block on the device.
+pub struct Params {
+    spans: Vec<Span>,
+    values: Buffer<f32>, // [len]
+    learning: Option<Learning>,
+    effective: Buffer<f32>, // [effective_len] W of every weight-normalised layer
+    d_effective: Buffer<f32>, // [effective_len] zero between steps
     row_table: Buffer<WeightRow>,
     n_rows: u64,
     forward: Kernel<kernels::weight_norm_forward::Args>,
@@ -305,18 +316,23 @@ impl Params {
         Some(first.first..last.first + last.len())
     }
 
-    /// Values, gradients, first and second moments, each `[len]`.
+    /// Values, and where the block learns gradients, first and second moments, each `[len]`.
     pub fn values(&self) -> &Buffer<f32> {
         &self.values
     }
     pub fn grads(&self) -> &Buffer<f32> {
-        &self.grads
+        &self.learning().grads
     }
     pub fn first_moment(&self) -> &Buffer<f32> {
-        &self.first_moment
+        &self.learning().first_moment
     }
     pub fn second_moment(&self) -> &Buffer<f32> {
-        &self.second_moment
+        &self.learning().second_moment
+    }
+
+    fn learning(&self) -> &Learning {
+        let learning = self.learning.as_ref();
+        learning.expect("a model that was built to be trained")
     }
 
     /// Refreshes the effective weights from v and g.
@@ -336,7 +352,7 @@ impl Params {
             rows: self.row_table.ptr(),
             params: self.values.ptr(),
             d_weights: self.d_effective.ptr_mut(),
-            d_params: self.grads.ptr_mut(),
+            d_params: self.grads().ptr_mut(),
             n: self.n_rows as u32,
         };
         rec.run(&self.backward, Work::items(self.n_rows), args);
@@ -353,7 +369,7 @@ impl Params {
     /// Where the matrix's gradient is accumulated.
     pub fn d_weight(&self, handle: WeightHandle, offset: u64) -> PtrMut<f32> {
         match handle.weight {
-            WeightAt::Plain(first) => self.grads.ptr_mut().offset(first + offset),
+            WeightAt::Plain(first) => self.grads().ptr_mut().offset(first + offset),
             WeightAt::Normalised(first) => self.d_effective.ptr_mut().offset(first + offset),
         }
     }
@@ -367,7 +383,7 @@ impl Params {
 
     /// Where the bias's gradient is accumulated.
     pub fn d_bias(&self, handle: WeightHandle, offset: u64) -> PtrMut<f32> {
-        self.grads
+        self.grads()
             .ptr_mut()
             .offset(handle.bias.map_or(0, |first| first + offset))
     }

@@ -87,7 +87,13 @@ impl Trainer {
         let views = ViewTable::new(gpu, region, pictures, others.iter())?;
 
         let n_rays = config.rays;
-        let model = Model::new(gpu, config, training.len() as u32, views.border_color())?;
+        let model = Model::new(
+            gpu,
+            config,
+            training.len() as u32,
+            views.border_color(),
+            true,
+        )?;
         let renderer = Renderer::new(gpu, config, &model, region, n_rays)?;
         let loss = Loss::new(gpu, config, n_rays)?;
         let scales = LossScales {

@@ -40,7 +40,7 @@ impl Trained {
             .iter()
             .filter(|view| view.split == Split::Train)
             .count();
-        let model = Model::new(gpu, &state.config, n_training as u32, [0.5; 3])?;
+        let model = Model::new(gpu, &state.config, n_training as u32, [0.5; 3], false)?;
         let values = model.params.values();
         for span in model.params.spans() {
             let tensor = Tensor {
