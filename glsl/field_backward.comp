@@ -1,26 +1,36 @@
 #version 460
-// Adjoint of field_forward up to the hash features, one point per invocation:
-//   d_h = w₂ d_out (+ what further heads send back),  d_u = d_h σ'(u),  d_e = W₁ᵀ d_u,  d_w₂ += h d_out,  d_b₂ += d_out.
-// u is computed again from z: reading it back would cost more than the sum. d_u goes to weight_gradient, d_e to hash_grid_backward.
+// Adjoint of field_forward up to the field's input, one point per invocation:
+//   d_h = w₂ d_out (+ what further heads send back),  d_u = d_h σ'(u),  d_z = W₁ᵀ d_u,  d_w₂ += h d_out,  d_b₂ += d_out,
+// and with SECOND_ORDER of field_gradient as well: from ȧ = J v (field_tangent), with s = σ'(u) ⊙ w₂ and ṡ = W₁ ȧ,
+//   d_u += ṡ w₂ σ''(u),  d_w₂ += ṡ σ'(u);  d_W₁ += s ȧᵀ is left to weight_gradient, as d_u zᵀ is.
+// u is computed again from z: reading it back would cost more than the sum. d_e, the hash features' part of d_z, goes to
+// hash_grid_backward; the coordinates' part is wanted with SECOND_ORDER only.
 #include "lib/prelude.glsl"
 #include "lib/field.glsl"
 
+layout(constant_id = 7) const uint SECOND_ORDER = 0;
+
 layout(push_constant, scalar) uniform Args {
-    F32s hidden_weight;     // [HIDDEN, INPUTS]
-    F32s hidden_bias;       // [HIDDEN]
-    F32s head_weight;       // [HIDDEN]
-    F32s inputs;            // [INPUTS, n]
-    F32s d_first;           // [n]
-    F32s d_hidden;          // [HIDDEN, n_hidden] from the other heads
+    F32s hidden_weight;      // [HIDDEN, INPUTS]
+    F32s hidden_bias;        // [HIDDEN]
+    F32s head_weight;        // [HIDDEN]
+    F32s inputs;             // [INPUTS, n]
+    F32s tangents;           // [INPUTS, n] ȧ, with SECOND_ORDER
+    F32s d_first;            // [n]
+    F32s d_hidden;           // [HIDDEN, n_hidden] from the other heads
     F32sMut d_preactivation; // [HIDDEN, n] d_u
-    F32sMut d_features;     // [LEVELS * FEATURES, n] d_e
-    F32sMut d_head_weight;  // [HIDDEN] accumulated
-    F32sMut d_head_bias;    // [1] accumulated
+    F32sMut steepness;       // [HIDDEN, n] s, with SECOND_ORDER
+    F32sMut d_inputs;        // [INPUTS, n] d_z; without SECOND_ORDER [LEVELS * FEATURES, n] d_e
+    F32sMut d_head_weight;   // [HIDDEN] accumulated
+    F32sMut d_head_bias;     // [1] accumulated
     uint n;
     uint n_hidden;
 };
 
-const uint FEATURE_INPUTS = LEVELS * FEATURES;
+const uint FIRST_INPUT = SECOND_ORDER != 0u ? 0u : COORDINATES;
+const uint OUT_INPUTS = INPUTS - FIRST_INPUT;
+const uint TANGENTS = SECOND_ORDER != 0u ? INPUTS : 1u;
+
 void main() {
     uint point = item();
     // Invocations past the end stay for the subgroup's sums and add nothing. (Summing up in shared memory first would halve the speed on
@@ -29,10 +39,14 @@ void main() {
     uint p = inside ? point : 0u;
     float z[INPUTS];
     [[unroll]] for (uint i = 0u; i < INPUTS; ++i) z[i] = inputs.at[i * n + p];
+    float z_dot[TANGENTS];
+    if (SECOND_ORDER != 0u) {
+        [[unroll]] for (uint i = 0u; i < TANGENTS; ++i) z_dot[i] = inside ? tangents.at[i * n + p] : 0.0;
+    }
     float d_out = inside ? d_first.at[p] : 0.0;
     bool has_heads = inside && point < n_hidden;
-    float d_e[FEATURE_INPUTS];
-    [[unroll]] for (uint i = 0u; i < FEATURE_INPUTS; ++i) d_e[i] = 0.0;
+    float d_z[OUT_INPUTS];
+    [[unroll]] for (uint i = 0u; i < OUT_INPUTS; ++i) d_z[i] = 0.0;
 
     for (uint first_neuron = 0u; first_neuron < HIDDEN; first_neuron += TILE) {
         float u[TILE];
@@ -40,21 +54,39 @@ void main() {
         [[unroll]] for (uint i = 0u; i < INPUTS; ++i) {
             [[unroll]] for (uint t = 0u; t < TILE; ++t) u[t] = fma(hidden_weight.at[(first_neuron + t) * INPUTS + i], z[i], u[t]);
         }
-        [[unroll]] for (uint t = 0u; t < TILE; ++t) {
-            float d_w2 = subgroupAdd(d_out * activation(u[t]));
-            if (subgroupElect()) add(d_head_weight, first_neuron + t, d_w2);
-            float d_h = d_out * head_weight.at[first_neuron + t];
-            if (has_heads) d_h += d_hidden.at[(first_neuron + t) * n_hidden + p];
-            u[t] = inside ? d_h * activation_derivative(u[t]) : 0.0;
-            if (inside) d_preactivation.at[(first_neuron + t) * n + p] = u[t];
+        float s_dot[TILE];
+        if (SECOND_ORDER != 0u) {
+            [[unroll]] for (uint t = 0u; t < TILE; ++t) s_dot[t] = 0.0;
+            [[unroll]] for (uint i = 0u; i < TANGENTS; ++i) {
+                [[unroll]] for (uint t = 0u; t < TILE; ++t)
+                    s_dot[t] = fma(hidden_weight.at[(first_neuron + t) * INPUTS + i], z_dot[i], s_dot[t]);
+            }
         }
-        [[unroll]] for (uint i = 0u; i < FEATURE_INPUTS; ++i) {
+        [[unroll]] for (uint t = 0u; t < TILE; ++t) {
+            uint neuron = first_neuron + t;
+            float w2 = head_weight.at[neuron];
+            float slope = activation_derivative(u[t]);
+            float d_w2 = d_out * activation(u[t]);
+            float d_h = d_out * w2;
+            if (has_heads) d_h += d_hidden.at[neuron * n_hidden + p];
+            float d_u = d_h * slope;
+            if (SECOND_ORDER != 0u) {
+                d_w2 += s_dot[t] * slope;
+                d_u += s_dot[t] * w2 * activation_curvature(slope);
+                if (inside) steepness.at[neuron * n + p] = slope * w2;
+            }
+            u[t] = inside ? d_u : 0.0;
+            if (inside) d_preactivation.at[neuron * n + p] = u[t];
+            d_w2 = subgroupAdd(d_w2);
+            if (subgroupElect()) add(d_head_weight, neuron, d_w2);
+        }
+        [[unroll]] for (uint i = 0u; i < OUT_INPUTS; ++i) {
             [[unroll]] for (uint t = 0u; t < TILE; ++t)
-                d_e[i] = fma(hidden_weight.at[(first_neuron + t) * INPUTS + COORDINATES + i], u[t], d_e[i]);
+                d_z[i] = fma(hidden_weight.at[(first_neuron + t) * INPUTS + FIRST_INPUT + i], u[t], d_z[i]);
         }
     }
     if (inside) {
-        [[unroll]] for (uint i = 0u; i < FEATURE_INPUTS; ++i) d_features.at[i * n + p] = d_e[i];
+        [[unroll]] for (uint i = 0u; i < OUT_INPUTS; ++i) d_inputs.at[i * n + p] = d_z[i];
     }
     if (BIAS != 0u) {
         float d_b2 = subgroupAdd(d_out);

@@ -20,3 +20,6 @@ float activation_derivative(float u) {
     float e = exp(-100.0 * abs(u));
     return (u >= 0.0 ? 1.0 : e) / (1.0 + e);
 }
+
+// σ'' from σ': of softplus(100 u)/100 it is 100 σ'(1 - σ'), of ReLU 0.
+float activation_curvature(float slope) { return SOFTPLUS != 0u ? 100.0 * slope * (1.0 - slope) : 0.0; }

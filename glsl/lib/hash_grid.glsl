@@ -53,6 +53,21 @@ float corner_weight(Cell cell, uint corner) {
     return w.x * w.y * w.z;
 }
 
+// d corner_weight / d x for x in [-1, 1]³. Along its own axis the trilinear weight is linear, so it depends on the other two only.
+vec3 corner_slope(Level level, Cell cell, uint corner) {
+    vec3 far = vec3(float(corner & 1u), float((corner >> 1u) & 1u), float(corner >> 2u));
+    vec3 w = mix(1.0 - cell.weight, cell.weight, far);
+    return 0.5 * level.scale * (2.0 * far - 1.0) * w.yzx * w.zxy;
+}
+
+// (d² corner_weight / d x²) v: only the mixed derivatives are there.
+vec3 corner_curvature(Level level, Cell cell, uint corner, vec3 v) {
+    vec3 far = vec3(float(corner & 1u), float((corner >> 1u) & 1u), float(corner >> 2u));
+    vec3 w = mix(1.0 - cell.weight, cell.weight, far);
+    vec3 sv = (2.0 * far - 1.0) * v;
+    return 0.25 * level.scale * level.scale * (2.0 * far - 1.0) * (sv.yzx * w.zxy + sv.zxy * w.yzx);
+}
+
 // Whether two corners of a cell may share an entry. A corner's hash differs from corner 0's by the exclusive or of what its steps along
 // x, y and z change; those three numbers are odd, since the primes are, so corners meet only where two of the three are equal. In a
 // dense level they meet nowhere, except that positions outside the cube may wrap onto anything.

@@ -1,0 +1,57 @@
+#version 460
+// Gradient of a field's first output with respect to position, by the chain rule, one point per invocation (METHOD 3):
+//   s = σ'(u) ⊙ w₂,  a = W₁ᵀ s,  g = Jᵀ a  with J = ∂z/∂x = [I; ∂e/∂x].
+// a is kept: with it the hash table hears from g (hash_grid_backward).
+#include "lib/prelude.glsl"
+#include "lib/hash_grid.glsl"
+#include "lib/field.glsl"
+
+layout(push_constant, scalar) uniform Args {
+    Levels levels;
+    F32s table;          // [entries, FEATURES]
+    F32s hidden_weight;  // [HIDDEN, INPUTS]
+    F32s hidden_bias;    // [HIDDEN]
+    F32s head_weight;    // [HIDDEN]
+    F32s points;         // [3, n] region frame
+    F32s inputs;         // [INPUTS, n] z, as field_forward left them
+    F32sMut slopes;      // [INPUTS, n] a
+    F32sMut gradient;    // [3, n] g, per region unit
+    uint n;
+};
+
+void main() {
+    uint point = item();
+    if (point >= n) return;
+    float z[INPUTS];
+    [[unroll]] for (uint i = 0u; i < INPUTS; ++i) z[i] = inputs.at[i * n + point];
+    float a[INPUTS];
+    [[unroll]] for (uint i = 0u; i < INPUTS; ++i) a[i] = 0.0;
+    for (uint first_neuron = 0u; first_neuron < HIDDEN; first_neuron += TILE) {
+        float u[TILE];
+        [[unroll]] for (uint t = 0u; t < TILE; ++t) u[t] = BIAS != 0u ? hidden_bias.at[first_neuron + t] : 0.0;
+        [[unroll]] for (uint i = 0u; i < INPUTS; ++i) {
+            [[unroll]] for (uint t = 0u; t < TILE; ++t) u[t] = fma(hidden_weight.at[(first_neuron + t) * INPUTS + i], z[i], u[t]);
+        }
+        [[unroll]] for (uint t = 0u; t < TILE; ++t) u[t] = activation_derivative(u[t]) * head_weight.at[first_neuron + t];
+        [[unroll]] for (uint i = 0u; i < INPUTS; ++i) {
+            [[unroll]] for (uint t = 0u; t < TILE; ++t) a[i] = fma(hidden_weight.at[(first_neuron + t) * INPUTS + i], u[t], a[i]);
+        }
+    }
+    [[unroll]] for (uint i = 0u; i < INPUTS; ++i) slopes.at[i * n + point] = a[i];
+
+    vec3 g = COORDINATES != 0u ? vec3(a[0], a[1], a[2]) : vec3(0.0);
+    vec3 x = vec3(points.at[point], points.at[n + point], points.at[2u * n + point]);
+    for (uint l = 0u; l < LEVELS; ++l) {
+        Level level = levels.at[l];
+        Cell cell = cell_of(level, x);
+        float slope[FEATURES];
+        [[unroll]] for (uint f = 0u; f < FEATURES; ++f) slope[f] = slopes.at[(COORDINATES + l * FEATURES + f) * n + point];
+        [[unroll]] for (uint corner = 0u; corner < 8u; ++corner) {
+            uint entry = corner_entry(level, cell, corner) * FEATURES;
+            float value = 0.0;
+            [[unroll]] for (uint f = 0u; f < FEATURES; ++f) value = fma(slope[f], table.at[entry + f], value);
+            g += value * corner_slope(level, cell, corner);
+        }
+    }
+    [[unroll]] for (uint axis = 0u; axis < 3u; ++axis) gradient.at[axis * n + point] = g[axis];
+}

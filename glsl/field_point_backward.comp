@@ -1,0 +1,50 @@
+#version 460
+// Gradient with respect to position, through a field's output and its gradient g, one point per invocation:
+//   d_x = Jᵀ d_z + Σ a (∂²e/∂x²) v,   d_z from field_backward, a from field_gradient, v = ∂loss/∂g.
+// The curvature of the network itself is in d_z.
+#include "lib/prelude.glsl"
+#include "lib/hash_grid.glsl"
+#include "lib/field.glsl"
+
+layout(push_constant, scalar) uniform Args {
+    Levels levels;
+    F32s table;       // [entries, FEATURES]
+    F32s points;      // [3, n]
+    F32s d_inputs;    // [INPUTS, n] d_z
+    F32s slopes;      // [INPUTS, n] a
+    F32s d_gradient;  // [3, n] v
+    F32sMut d_points; // [3, n]
+    uint n;
+};
+
+void main() {
+    uint point = item();
+    if (point >= n) return;
+    vec3 x = vec3(points.at[point], points.at[n + point], points.at[2u * n + point]);
+    vec3 v = vec3(d_gradient.at[point], d_gradient.at[n + point], d_gradient.at[2u * n + point]);
+    vec3 d_x = vec3(0.0);
+    if (COORDINATES != 0u) {
+        [[unroll]] for (uint c = 0u; c < 3u; ++c) d_x[c] = d_inputs.at[c * n + point];
+    }
+    for (uint l = 0u; l < LEVELS; ++l) {
+        Level level = levels.at[l];
+        Cell cell = cell_of(level, x);
+        float d_e[FEATURES], slope[FEATURES];
+        [[unroll]] for (uint f = 0u; f < FEATURES; ++f) {
+            uint row = (COORDINATES + l * FEATURES + f) * n + point;
+            d_e[f] = d_inputs.at[row];
+            slope[f] = slopes.at[row];
+        }
+        [[unroll]] for (uint corner = 0u; corner < 8u; ++corner) {
+            uint entry = corner_entry(level, cell, corner) * FEATURES;
+            float first = 0.0, second = 0.0;
+            [[unroll]] for (uint f = 0u; f < FEATURES; ++f) {
+                float value = table.at[entry + f];
+                first = fma(d_e[f], value, first);
+                second = fma(slope[f], value, second);
+            }
+            d_x += first * corner_slope(level, cell, corner) + second * corner_curvature(level, cell, corner, v);
+        }
+    }
+    [[unroll]] for (uint axis = 0u; axis < 3u; ++axis) d_points.at[axis * n + point] = d_x[axis];
+}

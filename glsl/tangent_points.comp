@@ -1,0 +1,28 @@
+#version 460
+// Points beside the samples for the tangent-normal loss, one sample per invocation (METHOD 4.5): q = m + 0.01 n × r, with the bin's
+// midpoint m, the unit normal n = g/‖g‖ at the bin's start and a random unit vector r.
+#include "lib/prelude.glsl"
+#include "lib/sampling.glsl"
+#include "lib/tangent.glsl"
+
+layout(push_constant, scalar) uniform Args {
+    F32s origins;     // [3, n_rays]
+    F32s directions;  // [3, n_rays]
+    F32s near_far;    // [2, n_rays]
+    F32s edges;       // [n_rays, n_samples + 1]
+    F32s gradient;    // [3, n] g
+    F32s draws;       // [2, n] in [0, 1)
+    F32sMut points;   // [3, n] q
+    uint n;
+    uint n_rays;
+};
+
+void main() {
+    uint p = item();
+    if (p >= n) return;
+    uint ray = p / (n / n_rays);
+    float t = bin_midpoint(ray_span(near_far, n_rays, ray), edges.at[p + ray], edges.at[p + ray + 1u]);
+    vec3 beside = TANGENT_STEP * cross(normal_of(vector_at(gradient, p, n)), random_direction(draws, p, n));
+    [[unroll]] for (uint axis = 0u; axis < 3u; ++axis)
+        points.at[axis * n + p] = origins.at[axis * n_rays + ray] + t * directions.at[axis * n_rays + ray] + beside[axis];
+}
