@@ -39,7 +39,10 @@ void main() {
     }
     [[unroll]] for (uint i = 0u; i < INPUTS; ++i) slopes.at[i * n + point] = a[i];
 
-    vec3 g = COORDINATES != 0u ? vec3(a[0], a[1], a[2]) : vec3(0.0);
+    vec3 g = vec3(0.0);
+    if (COORDINATES != 0u) {
+        [[unroll]] for (uint c = 0u; c < 3u; ++c) g[c] = slopes.at[c * n + point];
+    }
     vec3 x = vec3(points.at[point], points.at[n + point], points.at[2u * n + point]);
     for (uint l = 0u; l < LEVELS; ++l) {
         Level level = levels.at[l];

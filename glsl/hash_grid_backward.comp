@@ -10,11 +10,10 @@ void main() {
     if (point >= n) return;
     uint l = slice();
     Level level = levels.at[l];
-    Visit at = visit(level, l, point);
-    if (at.adds_nothing) return;
+    if (!visit(level, l, point)) return;
     [[unroll]] for (uint corner = 0u; corner < 8u; ++corner) {
-        uint entry = corner_entry(level, at.cell, corner) * FEATURES;
-        CornerFactors factors = corner_factors(level, at, corner);
-        [[unroll]] for (uint f = 0u; f < FEATURES; ++f) add(d_table, entry + f, added(at, factors, f));
+        uint entry = corner_entry(level, cell, corner) * FEATURES;
+        vec2 factors = corner_factors(level, corner);
+        [[unroll]] for (uint f = 0u; f < FEATURES; ++f) add(d_table, entry + f, added(factors, f));
     }
 }

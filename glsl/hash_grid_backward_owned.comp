@@ -9,15 +9,14 @@
 const uint POINTS = 4u;  // per turn of the loop
 
 void scatter(Level level, uint l, uint point) {
-    Visit at = visit(level, l, point);
-    if (at.adds_nothing) return;
+    if (!visit(level, l, point)) return;
     uint corner = gl_LocalInvocationID.x;
-    uint entry = corner_entry(level, at.cell, corner) * FEATURES;
-    CornerFactors factors = corner_factors(level, at, corner);
-    if (corners_may_meet(level, at.cell)) {
-        [[unroll]] for (uint f = 0u; f < FEATURES; ++f) add(d_table, entry + f, added(at, factors, f));
+    uint entry = corner_entry(level, cell, corner) * FEATURES;
+    vec2 factors = corner_factors(level, corner);
+    if (corners_may_meet(level, cell)) {
+        [[unroll]] for (uint f = 0u; f < FEATURES; ++f) add(d_table, entry + f, added(factors, f));
     } else {
-        [[unroll]] for (uint f = 0u; f < FEATURES; ++f) d_table.at[entry + f] += added(at, factors, f);
+        [[unroll]] for (uint f = 0u; f < FEATURES; ++f) d_table.at[entry + f] += added(factors, f);
     }
     // The next point's corners may be this one's, in other lanes.
     subgroupMemoryBarrierBuffer();

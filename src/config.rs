@@ -21,8 +21,10 @@ pub struct Config {
     pub preset: String,
     /// Seed of every random number: initial parameters, pixels, jitter, taps.
     pub seed: u32,
-    /// Length of the run. The schedules below are written for `schedule_steps` and stretched to this.
+    /// Length of the stage. The schedules below are written for `schedule_steps` and stretched to this.
     pub steps: u64,
+    /// Steps of the stage before it: the number that its own first step has.
+    pub first_step: u64,
     /// The number of steps that every schedule's own numbers refer to.
     pub schedule_steps: u64,
     /// Rays per training step.
@@ -36,7 +38,58 @@ pub struct Config {
     pub background: BackgroundConfig,
     pub loss: LossConfig,
     pub optimizer: OptimizerConfig,
+    pub stage2: Stage2Config,
     pub report: ReportConfig,
+}
+
+/// What the second stage does differently (METHOD 1.1, 1.4): beside what stands here, an analytic gradient and no bias correction.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Stage2Config {
+    /// Length of the stage; 0: there is none.
+    pub steps: u64,
+    pub rays: u32,
+    /// Weight of the tangent-normal loss.
+    pub tangent: f64,
+    pub scale_bound: ScaleBound,
+}
+
+impl Config {
+    /// The configuration of the second stage, or `None` where there is none. It begins with the first's parameters; optimiser and
+    /// schedules begin anew.
+    pub fn second_stage(&self) -> Option<Config> {
+        let stage2 = &self.stage2;
+        if stage2.steps == 0 {
+            return None;
+        }
+        let mut config = self.clone();
+        config.first_step = self.first_step + self.steps;
+        config.steps = stage2.steps;
+        config.rays = stage2.rays;
+        config.surface.gradient = GradientKind::Analytic;
+        config.loss.bias.weight = 0.0;
+        config.loss.bias.weight_start = 0.0;
+        config.loss.tangent = stage2.tangent;
+        config.loss.scale_bound = stage2.scale_bound.clone();
+        config.stage2.steps = 0;
+        Some(config)
+    }
+
+    /// The same with so many steps in all stages together, which keep their shares of them.
+    pub fn with_total_steps(self, total: u64) -> Config {
+        let mut config = self;
+        let stages = config.steps + config.stage2.steps;
+        let here = total.saturating_sub(config.first_step);
+        let share = u128::from(here) * u128::from(config.stage2.steps) / u128::from(stages.max(1));
+        config.stage2.steps = share as u64;
+        config.steps = here - config.stage2.steps;
+        config
+    }
+
+    /// Steps of this stage and all others.
+    pub fn total_steps(&self) -> u64 {
+        self.first_step + self.steps + self.stage2.steps
+    }
 }
 
 /// How the dataset is read, and the region that the surface may occupy.
@@ -100,8 +153,20 @@ pub struct SurfaceConfig {
     pub scale_max: f64,
     /// Floor of the local scale.
     pub scale_floor: f64,
+    /// How the SDF's gradient is had.
+    pub gradient: GradientKind,
     /// Taps lie U(0, tap_range) away, floored at a quarter of the finest cell.
     pub tap_range: f64,
+}
+
+/// How the gradient of the signed distance is had, and with it what the density is a function of (METHOD 3, 2.5).
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum GradientKind {
+    /// Central differences at a random distance; density of the signed distance (stage 1).
+    Taps,
+    /// The chain rule; density of the signed distance along the line of sight (stage 2).
+    Analytic,
 }
 
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -183,8 +248,10 @@ pub enum BackgroundKind {
 pub struct LossConfig {
     pub eikonal: f64,
     pub interlevel: f64,
+    /// Tangent-normal consistency (METHOD 4.5); needs the analytic gradient.
+    pub tangent: f64,
     pub bias: BiasConfig,
-    /// Schedule A: lower bound of 1/β from `start` to `end`, logarithmic, over `steps` schedule steps.
+    /// Lower bound of 1/β from `start` to `end` over `steps` schedule steps.
     pub scale_bound: ScaleBound,
 }
 
@@ -212,9 +279,23 @@ pub enum BiasReduction {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ScaleBound {
+    pub rise: Rise,
     pub start: f64,
     pub end: f64,
     pub steps: u64,
+    /// From `end` to here, exponentially, over `last_steps` more (0: none).
+    pub last: f64,
+    pub last_steps: u64,
+}
+
+/// How a bound rises over x from 0 to 1.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Rise {
+    /// log₂(1 + x), fast first (schedule A, stage 1).
+    Logarithmic,
+    /// (e^{4x} − 1)/(e⁴ − 1), fast last (schedule B, stage 2).
+    Exponential,
 }
 
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

@@ -14,41 +14,33 @@ layout(push_constant, scalar) uniform Args {
     uint n;
 };
 
-// One point in one level.
-struct Visit {
-    Cell cell;
-    vec3 v;
-    float d_e[FEATURES];
-    float a[FEATURES];
-    bool adds_nothing;
-};
+// The point at hand, in the level at hand.
+Cell cell;
+float d_e[FEATURES];
+float a[FEATURES];
+vec3 v;
 
-Visit visit(Level level, uint l, uint point) {
-    Visit at;
-    at.cell = cell_of(level, vec3(points.at[point], points.at[n + point], points.at[2u * n + point]));
-    at.adds_nothing = true;
+// Turns to a point; false if it adds nothing to this level.
+bool visit(Level level, uint l, uint point) {
+    bool adds = false;
     [[unroll]] for (uint f = 0u; f < FEATURES; ++f) {
-        at.d_e[f] = d_features.at[(l * FEATURES + f) * n + point];
-        at.adds_nothing = at.adds_nothing && at.d_e[f] == 0.0;
+        d_e[f] = d_features.at[(l * FEATURES + f) * n + point];
+        adds = adds || d_e[f] != 0.0;
     }
     if (SECOND_ORDER != 0u) {
-        [[unroll]] for (uint f = 0u; f < FEATURES; ++f) at.a[f] = slopes.at[(l * FEATURES + f) * n + point];
-        at.v = vec3(d_gradient.at[point], d_gradient.at[n + point], d_gradient.at[2u * n + point]);
-        at.adds_nothing = at.adds_nothing && at.v == vec3(0.0);
+        [[unroll]] for (uint f = 0u; f < FEATURES; ++f) a[f] = slopes.at[(l * FEATURES + f) * n + point];
+        v = vec3(d_gradient.at[point], d_gradient.at[n + point], d_gradient.at[2u * n + point]);
+        adds = adds || v != vec3(0.0);
     }
-    return at;
+    cell = cell_of(level, vec3(points.at[point], points.at[n + point], points.at[2u * n + point]));
+    return adds;
 }
 
-// d_table[corner] += w d_e + (∂w/∂x · v) a, with the corner's weight w.
-struct CornerFactors {
-    float weight;
-    float along;
-};
-
-CornerFactors corner_factors(Level level, Visit at, uint corner) {
-    return CornerFactors(corner_weight(at.cell, corner), SECOND_ORDER != 0u ? dot(corner_slope(level, at.cell, corner), at.v) : 0.0);
+// d_table[corner] += w d_e + (∂w/∂x · v) a with the corner's weight w: the factors of d_e and of a.
+vec2 corner_factors(Level level, uint corner) {
+    return vec2(corner_weight(cell, corner), SECOND_ORDER != 0u ? dot(corner_slope(level, cell, corner), v) : 0.0);
 }
 
-float added(Visit at, CornerFactors factors, uint f) {
-    return SECOND_ORDER != 0u ? fma(factors.along, at.a[f], factors.weight * at.d_e[f]) : factors.weight * at.d_e[f];
+float added(vec2 factors, uint f) {
+    return SECOND_ORDER != 0u ? fma(factors.y, a[f], factors.x * d_e[f]) : factors.x * d_e[f];
 }

@@ -323,6 +323,7 @@ impl<'c> Demo<'c> {
         // A curve of some ten looks at the held-out view, small ones, since each costs as much as many steps.
         config
             .with_assignment(&format!("steps={steps}"))?
+            .with_assignment("stage2.steps=0")?
             .with_assignment(&format!("report.preview_steps={}", (steps / 10).max(50)))?
             .with_assignment("report.preview_pixels=12000")?
             .with_assignment(&format!("report.log_steps={}", (steps / 400).max(1)))

@@ -24,7 +24,7 @@ use std::time::Instant;
 #[command(after_help = "\
 Example:
   neurodin profile photos/ --preset outdoor-tiny --steps 50
-  neurodin profile photos/ --preset outdoor-large --steps 20 --trace trace.json
+  neurodin profile photos/ --preset outdoor-large --stage 2 --steps 20 --trace trace.json
 
 The trace opens in chrome://tracing and ui.perfetto.dev. Shares of the roofs compare what a kernel was said to need
 with the fastest copy and the fastest arithmetic that were measured on the device.")]
@@ -70,6 +70,12 @@ pub(super) fn run(args: &ProfileArgs, context: &Context) -> anyhow::Result<()> {
     };
     let scene = open_scene(&settings, &args.scene, &args.dataset)?;
     let (config, chosen) = configure(&settings, &args.scene, &scene)?;
+    let config = match args.settings.stage {
+        Some(2) => config.second_stage().ok_or_else(|| Error::Config {
+            what: "stage2.steps = 0: there is no second stage to time".into(),
+        })?,
+        _ => config,
+    };
     let region = Region::estimate(&scene, &region_wanted(&args.scene, &config))?;
     let gpu = context.gpu_with(GpuOptions {
         profile: true,
@@ -80,7 +86,7 @@ pub(super) fn run(args: &ProfileArgs, context: &Context) -> anyhow::Result<()> {
     let roofs = gpu.measure_roofs()?;
     let mut trainer = Trainer::new(&gpu, &scene, &region, &config)?;
     let interrupted = interrupt::flag("stopping")?;
-    let mut progress = Progress::new(context, "profile", args.warmup + steps);
+    let mut progress = Progress::new(context, "profile", config.first_step + args.warmup + steps);
     let mut take = |trainer: &mut Trainer, count: u64| -> Result<()> {
         for _ in 0..count {
             trainer.step()?;

@@ -15,9 +15,12 @@ pub(super) struct SettingsArgs {
     /// TOML file of settings that differ from the preset
     #[arg(long, value_name = "FILE", env = "NEURODIN_CONFIG")]
     pub config: Option<PathBuf>,
-    /// Length of the run; every schedule is stretched to it
+    /// Length of the run, all stages together; every schedule is stretched to it
     #[arg(long, value_name = "N", env = "NEURODIN_STEPS")]
     pub steps: Option<u64>,
+    /// Only this stage; 2 goes on from a run whose first is done
+    #[arg(long, value_name = "1|2", value_parser = clap::value_parser!(u8).range(1..=2))]
+    pub stage: Option<u8>,
     /// Seed of every random number
     #[arg(long, value_name = "N", env = "NEURODIN_SEED")]
     pub seed: Option<u32>,
@@ -68,8 +71,11 @@ impl SettingsArgs {
         for assignment in &self.set {
             config = config.with_assignment(assignment)?;
         }
+        if self.stage == Some(1) {
+            config.stage2.steps = 0;
+        }
         if let Some(steps) = self.steps {
-            config.steps = steps;
+            config = config.with_total_steps(steps);
         }
         if let Some(seed) = self.seed {
             config.seed = seed;

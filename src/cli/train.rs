@@ -149,6 +149,12 @@ struct Task {
 
 /// A new run.
 fn begin(args: &TrainArgs, out: &Path, context: &Context) -> anyhow::Result<Task> {
+    if args.settings.stage == Some(2) {
+        return Err(Error::Config {
+            what: "stage 2 goes on from a run whose first stage is done: name it by --out, with --resume".into(),
+        }
+        .into());
+    }
     RunDirectory::check_free(out, args.force)?;
     let dataset = args.dataset.as_deref().expect("clap requires it");
     let scene = open_scene(&args.settings, &args.scene, dataset)?;
@@ -167,8 +173,10 @@ fn begin(args: &TrainArgs, out: &Path, context: &Context) -> anyhow::Result<Task
     ));
     context.say(&format!("region   {}", in_words(&region)));
     context.say(&format!(
-        "preset   {}{chosen}, {} steps, seed {}",
-        config.preset, config.steps, config.seed
+        "preset   {}{chosen}, {}, seed {}",
+        config.preset,
+        in_stages(&config),
+        config.seed
     ));
     let gpu = context.gpu()?;
     let trainer = Trainer::new(&gpu, &scene, &region, &config)?;
@@ -199,6 +207,14 @@ fn say_device(gpu: &Gpu, in_full: bool, context: &Context) {
     }
 }
 
+/// How long the stages are.
+fn in_stages(config: &Config) -> String {
+    match config.stage2.steps {
+        0 => format!("{} steps", config.steps),
+        second => format!("{} steps, then {second} of stage 2", config.steps),
+    }
+}
+
 fn in_words(region: &Region) -> String {
     let (center, radius) = (region.center, region.radius);
     let shape = match region.shape {
@@ -225,9 +241,14 @@ struct Resumed {
 fn resumed(args: &TrainArgs, out: &Path) -> Result<Resumed> {
     let run = RunDirectory::open(out)?;
     let latest = checkpoint::latest(&run.checkpoints())?;
+    let mut was = latest.checkpoint.state().config.clone();
+    if args.settings.stage == Some(2) && was.first_step == 0 && was.stage2.steps == 0 {
+        // It was begun without a second stage: that is as long now as its preset has it.
+        was.stage2.steps = Config::preset(&was.preset)?.stage2.steps;
+    }
     let config = args
         .settings
-        .resolve(latest.checkpoint.state().config.clone())
+        .resolve(was)
         .and_then(|config| with_scene_flags(&args.scene, config))?;
     Ok(Resumed {
         run,
@@ -273,7 +294,7 @@ fn resume(args: &TrainArgs, out: &Path, context: &Context) -> anyhow::Result<Tas
     context.say(&format!(
         "resume   {} of {} steps done, from {}",
         state.step,
-        config.steps,
+        config.total_steps(),
         latest.checkpoint.path().display()
     ));
     let record = SceneRecord::load(&run)?;
@@ -305,7 +326,7 @@ impl Task {
         let mut teller = Teller {
             context,
             log: Log::append(&run.log())?,
-            progress: Progress::new(context, "train", self.config.steps),
+            progress: Progress::new(context, "train", self.config.total_steps()),
             interrupted: &interrupted,
             note: String::new(),
             failed: None,
@@ -317,9 +338,19 @@ impl Task {
             teller.hear(Event::Resumed { step, path });
         }
         let begun = Instant::now();
-        let outcome = self
-            .trainer
-            .run(&self.scene, &run, &mut |event| teller.hear(event));
+        let mut steps_done = self.trainer.steps_done();
+        let mut trainer = Some(self.trainer);
+        let mut outcome = Ok(());
+        while let Some(mut stage) = trainer.take() {
+            outcome = stage.run(&self.scene, &run, &mut |event| teller.hear(event));
+            steps_done = stage.steps_done();
+            if outcome.is_ok() {
+                match stage.next_stage(&self.scene, &run) {
+                    Ok(next) => trainer = next,
+                    Err(error) => outcome = Err(error),
+                }
+            }
+        }
         let Teller {
             failed,
             psnr,
@@ -338,14 +369,14 @@ impl Task {
         let seconds = begun.elapsed();
         let result = json!({
             "run": run.root(),
-            "step": self.trainer.steps_done(),
+            "step": steps_done,
             "seconds": seconds.as_secs_f64(),
             "preview_psnr": psnr,
             "checkpoint": checkpoint,
         });
         let text = format!(
             "done     {} steps in {}; next: neurodin mesh {} -o mesh.ply",
-            self.trainer.steps_done(),
+            steps_done,
             clock(seconds),
             run.root().display()
         );

@@ -20,17 +20,17 @@ pub struct Preset {
 pub const PRESETS: &[Preset] = &[
     Preset {
         name: "outdoor-large",
-        summary: "NeuRodin stage 1, large outdoor scenes: a GPU, hours",
+        summary: "NeuRodin, large outdoor scenes: a GPU, hours",
         toml: COMPLETE,
     },
     Preset {
         name: "indoor-large",
-        summary: "NeuRodin stage 1, halls and large interiors: a GPU, hours",
+        summary: "NeuRodin, halls and large interiors: a GPU, hours",
         toml: include_str!("presets/indoor-large.toml"),
     },
     Preset {
         name: "indoor-small",
-        summary: "NeuRodin stage 1, single rooms: a GPU, hours",
+        summary: "NeuRodin, single rooms: a GPU, hours",
         toml: include_str!("presets/indoor-small.toml"),
     },
     Preset {

@@ -1,6 +1,6 @@
 //! Ranges: which settings the kernels and the method accept. Each complaint gives key, value and range.
 
-use super::{BackgroundKind, Config, MultiStep};
+use super::{BackgroundKind, Config, GradientKind, MultiStep, ScaleBound};
 use crate::{Error, Result};
 use std::fmt::Display;
 
@@ -40,6 +40,14 @@ impl Config {
         wrong.real("surface.scale_max", self.surface.scale_max, 1e-4, 10.0);
         wrong.real("surface.scale_floor", self.surface.scale_floor, 1e-6, 1.0);
         wrong.real("surface.tap_range", self.surface.tap_range, 1e-6, 1.0);
+        wrong.real("loss.tangent", self.loss.tangent, 0.0, 1e3);
+        if self.loss.tangent > 0.0 && self.surface.gradient != GradientKind::Analytic {
+            wrong.add(
+                "loss.tangent",
+                self.loss.tangent,
+                "0 where surface.gradient is not \"analytic\"",
+            );
+        }
         wrong.network("color.hidden", self.color.hidden);
         wrong.whole("color.layers", self.color.layers, 1, 8);
         wrong.whole("appearance.dims", self.appearance.dims, 0, 64);
@@ -90,14 +98,11 @@ impl Config {
         wrong.real("loss.bias.weight_start", loss.bias.weight_start, 0.0, 1e3);
         wrong.real("loss.bias.epsilon", loss.bias.epsilon, 0.0, 1.0);
         wrong.real("loss.bias.offset", loss.bias.offset, 0.0, 1.0);
-        wrong.real("loss.scale_bound.start", loss.scale_bound.start, 0.0, 1e6);
-        wrong.real("loss.scale_bound.end", loss.scale_bound.end, 0.0, 1e6);
-        wrong.whole(
-            "loss.scale_bound.steps",
-            loss.scale_bound.steps,
-            1,
-            u64::MAX,
-        );
+        wrong.scale_bound("loss.scale_bound", &loss.scale_bound);
+        wrong.scale_bound("stage2.scale_bound", &self.stage2.scale_bound);
+        wrong.whole("stage2.steps", self.stage2.steps, 0, 100_000_000);
+        wrong.whole("stage2.rays", self.stage2.rays, 1, 65_536);
+        wrong.real("stage2.tangent", self.stage2.tangent, 0.0, 1e3);
 
         let optimizer = &self.optimizer;
         wrong.multi_step("optimizer.fields", &optimizer.fields);
@@ -213,6 +218,19 @@ impl Complaints {
         if ![1, 2, 4, 8].contains(&features) {
             self.add(&format!("{group}{dot}features"), features, "1, 2, 4 or 8");
         }
+    }
+
+    fn scale_bound(&mut self, group: &str, bound: &ScaleBound) {
+        self.real(&format!("{group}.start"), bound.start, 0.0, 1e6);
+        self.real(&format!("{group}.end"), bound.end, 0.0, 1e6);
+        self.real(&format!("{group}.last"), bound.last, 0.0, 1e6);
+        self.whole(&format!("{group}.steps"), bound.steps, 0, 100_000_000);
+        self.whole(
+            &format!("{group}.last_steps"),
+            bound.last_steps,
+            0,
+            100_000_000,
+        );
     }
 
     fn multi_step(&mut self, group: &str, group_of: &MultiStep) {

@@ -44,10 +44,11 @@ impl<'m> Field<'m> {
         gpu.upload(&tap_draws, 0, &vec![tap_step / range; SHADE_BATCH as usize])?;
         let code = gpu.buffer("appearance row", u64::from(SHADE_BATCH))?;
         gpu.upload(&code, 0, &vec![model.n_views; SHADE_BATCH as usize])?;
+        let shape = model.surface.field.shape.without_gradient();
         Ok(Field {
             lattice: gpu.kernel(lattice_points::Shape::default())?,
             points: gpu.scratch("lattice points", 3 * u64::from(BATCH))?,
-            batch: FieldBuffers::new(gpu, "lattice", &model.surface.field.shape, BATCH, 0)?,
+            batch: FieldBuffers::new(gpu, "lattice", &shape, BATCH, 0)?,
             distances: gpu.scratch("lattice distances", u64::from(BATCH))?,
             surface: model.surface.buffers(gpu, SHADE_BATCH)?,
             directions: gpu.buffer("view directions", 3 * u64::from(SHADE_BATCH))?,
@@ -81,14 +82,14 @@ impl<'m> Field<'m> {
         Ok(distances)
     }
 
-    /// Uploads samples with their six taps, shades them as seen along `directions`, and returns colours and gradients.
+    /// Uploads samples with their taps, if any, shades them as seen along `directions`, and returns colours and gradients.
     fn shade(&mut self, points: &[[f32; 3]], directions: &[[f32; 3]]) -> Result<PointAttributes> {
         let n = SHADE_BATCH as usize;
         let mut all = Vec::with_capacity(21 * n);
         for axis in 0..3 {
-            for block in 0..7 {
+            for block in 0..self.model.surface.blocks() {
                 // Blocks after the first: +x −x +y −y +z −z.
-                let on_axis = block > 0 && (block - 1) / 2 == axis;
+                let on_axis = block > 0 && (block - 1) / 2 == axis as u32;
                 let offset = if !on_axis {
                     0.0
                 } else if block % 2 == 1 {

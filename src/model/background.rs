@@ -53,6 +53,7 @@ impl Background {
             hidden: b.hidden,
             coordinates: false,
             softplus: false,
+            gradient: false,
         })
     }
 

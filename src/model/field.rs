@@ -6,7 +6,8 @@ use super::params::{Params, WeightHandle};
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, Kernel, Ptr, PtrMut, Recorder, Work};
 use crate::kernels::{
-    Level, field_backward, field_forward, hash_grid_backward, hash_grid_backward_owned,
+    Level, field_backward, field_forward, field_gradient, field_point_backward, field_tangent,
+    hash_grid_backward, hash_grid_backward_owned,
 };
 
 /// What fixes a field's kernels.
@@ -18,12 +19,31 @@ pub struct FieldShape {
     pub coordinates: bool,
     /// softplus(100 u)/100, or ReLU.
     pub softplus: bool,
+    /// The first output's gradient with respect to position is asked for, and learned from.
+    pub gradient: bool,
 }
 
 impl FieldShape {
     /// Inputs of the hidden layer.
     pub fn inputs(&self) -> u32 {
-        self.grid.outputs() + if self.coordinates { 3 } else { 0 }
+        self.grid.outputs() + self.coordinate_inputs()
+    }
+
+    fn coordinate_inputs(&self) -> u32 {
+        if self.coordinates { 3 } else { 0 }
+    }
+
+    /// The same, for points whose gradient nobody asks for.
+    pub fn without_gradient(self) -> FieldShape {
+        FieldShape {
+            gradient: false,
+            ..self
+        }
+    }
+
+    /// Rows that only fields with a gradient need.
+    fn with_gradient(&self, rows: u32) -> u32 {
+        if self.gradient { rows } else { 0 }
     }
 }
 
@@ -38,6 +58,16 @@ pub struct Field {
     backward: Kernel<field_backward::Args>,
     scatter: Scatter,
     hidden_gradient: Layer,
+    by_chain_rule: Option<GradientKernels>,
+}
+
+/// Kernels of the first output's gradient g = Jᵀ a.
+struct GradientKernels {
+    gradient: Kernel<field_gradient::Args>,
+    tangent: Kernel<field_tangent::Args>,
+    points: Kernel<field_point_backward::Args>,
+    /// d_W₁ += s ȧᵀ.
+    steepness: Layer,
 }
 
 /// How the device evaluates a field.
@@ -62,44 +92,75 @@ pub struct FieldBuffers {
     pub inputs: Buffer<f32>,   // [inputs, n]
     pub hidden: Buffer<f32>,   // [hidden, n_hidden]
     pub d_hidden: Buffer<f32>, // [hidden, n_hidden]
+    slope: Option<Slope>,
+}
+
+/// The gradient of a field's first output, and what its backward pass reads.
+pub struct Slope {
+    pub gradient: Buffer<f32>,   // [3, n] g, per region unit
+    pub d_gradient: Buffer<f32>, // [3, n]
+    slopes: Buffer<f32>,         // [inputs, n] a
 }
 
 impl FieldBuffers {
     /// Buffers for `n` points of fields of this shape.
     pub fn new(gpu: &Gpu, name: &str, shape: &FieldShape, n: u32, n_hidden: u32) -> Result<Self> {
         let hidden_len = u64::from(shape.hidden) * u64::from(n_hidden.max(1));
+        let planes = |what: &str, channels: u32| {
+            gpu.scratch(
+                &format!("{name} {what}"),
+                u64::from(channels) * u64::from(n),
+            )
+        };
+        let slope = match shape.gradient {
+            true => Some(Slope {
+                gradient: planes("gradient", 3)?,
+                d_gradient: planes("d_gradient", 3)?,
+                slopes: planes("slopes", shape.inputs())?,
+            }),
+            false => None,
+        };
         Ok(FieldBuffers {
             n,
             n_hidden,
-            inputs: gpu.scratch(
-                &format!("{name} inputs"),
-                u64::from(shape.inputs()) * u64::from(n),
-            )?,
+            inputs: planes("inputs", shape.inputs())?,
             hidden: gpu.scratch(&format!("{name} hidden"), hidden_len)?,
             d_hidden: gpu.scratch(&format!("{name} d_hidden"), hidden_len)?,
+            slope,
         })
+    }
+
+    /// The gradient's buffers.
+    ///
+    /// # Panics
+    /// If the field has none.
+    pub fn slope(&self) -> &Slope {
+        self.slope.as_ref().expect("a field with a gradient")
     }
 }
 
 /// Memory that a field's backward pass needs only while it runs; one for all fields.
 pub struct Scratch {
     d_preactivation: Buffer<f32>, // [hidden, n] of the largest field
-    d_features: Buffer<f32>,      // [features, n] of the largest field
+    d_inputs: Buffer<f32>, // [inputs, n] of the largest field; only the hash features' rows where there is no gradient
+    steepness: Buffer<f32>, // [hidden, n] of the largest field with a gradient: s
+    tangents: Buffer<f32>, // [inputs, n] of the largest field with a gradient: ȧ
 }
 
 impl Scratch {
     /// Enough for each of the given (shape, points).
     pub fn new(gpu: &Gpu, users: &[(FieldShape, u32)]) -> Result<Self> {
         let most = |per_point: fn(&FieldShape) -> u32| {
-            users
+            let sizes = users
                 .iter()
-                .map(|(shape, n)| u64::from(per_point(shape)) * u64::from(*n))
-                .max()
-                .unwrap_or(1)
+                .map(|(shape, n)| u64::from(per_point(shape)) * u64::from(*n));
+            sizes.max().unwrap_or(1).max(1)
         };
         Ok(Scratch {
             d_preactivation: gpu.scratch("d_preactivation", most(|s| s.hidden))?,
-            d_features: gpu.scratch("d_features", most(|s| s.grid.outputs()))?,
+            d_inputs: gpu.scratch("d_inputs", most(FieldShape::inputs))?,
+            steepness: gpu.scratch("steepness", most(|s| s.with_gradient(s.hidden)))?,
+            tangents: gpu.scratch("tangents", most(|s| s.with_gradient(s.inputs())))?,
         })
     }
 }
@@ -118,7 +179,8 @@ impl Field {
         let levels = gpu.buffer::<Level>(&format!("{label} levels"), table_rows.len() as u64)?;
         gpu.upload(&levels, 0, &table_rows)?;
         let (grid_levels, features) = (shape.grid.levels, shape.grid.features);
-        let coordinates = if shape.coordinates { 3 } else { 0 };
+        let coordinates = shape.coordinate_inputs();
+        let second_order = u32::from(shape.gradient);
         let softplus = u32::from(shape.softplus);
         let bias = u32::from(hidden.bias.is_some());
         let tile = shape.hidden.min(8);
@@ -140,14 +202,53 @@ impl Field {
             softplus,
             bias,
             tile,
+            second_order,
         };
-        let gradient = LayerShape {
+        let hidden_layer = || LayerShape {
             inputs: shape.inputs(),
             outputs: shape.hidden,
             first_row: 0,
             activation: Activation::None,
             backward_inputs: 0,
             inputs_are_relu: false,
+        };
+        let by_chain_rule = match shape.gradient {
+            true => Some(GradientKernels {
+                gradient: gpu
+                    .kernel(field_gradient::Shape {
+                        levels: grid_levels,
+                        features,
+                        hidden: shape.hidden,
+                        coordinates,
+                        softplus,
+                        bias,
+                        tile,
+                    })?
+                    .labelled(label),
+                tangent: gpu
+                    .kernel(field_tangent::Shape {
+                        levels: grid_levels,
+                        features,
+                        coordinates,
+                        ..field_tangent::Shape::default()
+                    })?
+                    .labelled(label),
+                points: gpu
+                    .kernel(field_point_backward::Shape {
+                        levels: grid_levels,
+                        features,
+                        coordinates,
+                        ..field_point_backward::Shape::default()
+                    })?
+                    .labelled(label),
+                steepness: Layer::new(
+                    gpu,
+                    &format!("{label} steepness"),
+                    hidden_layer(),
+                    hidden.without_bias(),
+                )?,
+            }),
+            false => None,
         };
         let few_cores = gpu.info().few_cores;
         let forward_part = |part, name: &str| -> Result<_> {
@@ -172,6 +273,7 @@ impl Field {
                     let shape = hash_grid_backward_owned::Shape {
                         levels: grid_levels,
                         features,
+                        second_order,
                     };
                     Scatter::Owned(gpu.kernel(shape)?.labelled(label))
                 }
@@ -179,11 +281,13 @@ impl Field {
                     let shape = hash_grid_backward::Shape {
                         levels: grid_levels,
                         features,
+                        second_order,
                     };
                     Scatter::Atomic(gpu.kernel(shape)?.labelled(label))
                 }
             },
-            hidden_gradient: Layer::new(gpu, &format!("{label} hidden"), gradient, hidden)?,
+            hidden_gradient: Layer::new(gpu, &format!("{label} hidden"), hidden_layer(), hidden)?,
+            by_chain_rule,
             shape,
         })
     }
@@ -243,7 +347,35 @@ impl Field {
         }
     }
 
-    /// Adds all parameter gradients, from `d_first [n]` and, for the leading points, the heads' `buffers.d_hidden`.
+    /// Gradient of the first output at the points of the last [`Field::forward`], into the buffers' `gradient`.
+    pub fn gradient(
+        &self,
+        rec: &mut Recorder,
+        params: &Params,
+        points: Ptr<f32>,
+        buffers: &FieldBuffers,
+    ) {
+        let (n, out) = (buffers.n, buffers.slope());
+        let args = field_gradient::Args {
+            levels: self.levels.ptr(),
+            table: params.values().ptr().offset(self.table),
+            hidden_weight: params.weight(self.hidden, 0),
+            hidden_bias: params.bias(self.hidden, 0),
+            head_weight: params.weight(self.heads, 0),
+            points,
+            inputs: buffers.inputs.ptr(),
+            slopes: out.slopes.ptr_mut(),
+            gradient: out.gradient.ptr_mut(),
+            n,
+        };
+        let flops = 2.0 * self.hidden_flops() + 4.0 * self.interpolation_flops();
+        let bytes = self.gather_bytes() + 16.0 * f64::from(self.shape.inputs());
+        let work = Work::items(u64::from(n)).flops(flops).bytes(bytes);
+        rec.run(&self.kernels().gradient, work, args);
+    }
+
+    /// Adds all parameter gradients, from `d_first [n]`, for the leading points the heads' `buffers.d_hidden`, and for a field with a
+    /// gradient `d_gradient` of its buffers.
     pub fn backward(
         &self,
         rec: &mut Recorder,
@@ -254,39 +386,69 @@ impl Field {
         scratch: &Scratch,
     ) {
         let n = buffers.n;
+        let slope = buffers.slope.as_ref();
+        let items = Work::items(u64::from(n));
+        let rows = 4.0 * f64::from(self.shape.inputs());
+        if let Some(slope) = slope {
+            let args = field_tangent::Args {
+                levels: self.levels.ptr(),
+                table: params.values().ptr().offset(self.table),
+                points,
+                d_gradient: slope.d_gradient.ptr(),
+                tangents: scratch.tangents.ptr_mut(),
+                n,
+            };
+            let work = items.flops(4.0 * self.interpolation_flops());
+            rec.run(
+                &self.kernels().tangent,
+                work.bytes(self.gather_bytes() + rows),
+                args,
+            );
+        }
         let args = field_backward::Args {
             hidden_weight: params.weight(self.hidden, 0),
             hidden_bias: params.bias(self.hidden, 0),
             head_weight: params.weight(self.heads, 0),
             inputs: buffers.inputs.ptr(),
+            tangents: scratch.tangents.ptr(),
             d_first,
             d_hidden: buffers.d_hidden.ptr(),
             d_preactivation: scratch.d_preactivation.ptr_mut(),
-            d_features: scratch.d_features.ptr_mut(),
+            steepness: scratch.steepness.ptr_mut(),
+            d_inputs: scratch.d_inputs.ptr_mut(),
             d_head_weight: params.d_weight(self.heads, 0),
             d_head_bias: params.d_bias(self.heads, 0),
             n,
             n_hidden: buffers.n_hidden,
         };
-        let bytes =
-            4.0 * f64::from(self.shape.inputs() + self.shape.hidden + self.shape.grid.outputs());
+        let products = if slope.is_some() { 3.0 } else { 2.0 };
+        let work = items.flops(products * self.hidden_flops());
         rec.run(
             &self.backward,
-            Work::items(u64::from(n))
-                .flops(2.0 * self.hidden_flops())
-                .bytes(bytes),
+            work.bytes(products * rows + 4.0 * f64::from(self.shape.hidden)),
             args,
         );
-        self.hidden_gradient.gradient(
-            rec,
-            params,
-            buffers.inputs.ptr(),
-            n,
-            scratch.d_preactivation.ptr(),
-            n,
-        );
+        let d_preactivation = scratch.d_preactivation.ptr();
+        self.hidden_gradient
+            .gradient(rec, params, buffers.inputs.ptr(), n, d_preactivation, n);
+        let coordinates = u64::from(self.shape.coordinate_inputs()) * u64::from(n);
+        let (d_features, slopes, d_gradient) = match slope {
+            Some(slope) => {
+                let (tangents, steepness) = (scratch.tangents.ptr(), scratch.steepness.ptr());
+                self.kernels()
+                    .steepness
+                    .gradient(rec, params, tangents, n, steepness, n);
+                (
+                    scratch.d_inputs.ptr().offset(coordinates),
+                    slope.slopes.ptr().offset(coordinates),
+                    slope.d_gradient.ptr(),
+                )
+            }
+            // Nobody reads the last two.
+            None => (scratch.d_inputs.ptr(), points, points),
+        };
         let d_table = params.grads().ptr_mut().offset(self.table);
-        let (levels, d_features) = (self.levels.ptr(), scratch.d_features.ptr());
+        let levels = self.levels.ptr();
         let slices = self.shape.grid.levels;
         let flops = self.interpolation_flops() / f64::from(slices);
         let bytes = 2.0 * self.gather_bytes() / f64::from(slices);
@@ -296,17 +458,20 @@ impl Field {
                     levels,
                     points,
                     d_features,
+                    slopes,
+                    d_gradient,
                     d_table,
                     n,
                 };
-                let work = Work::items(u64::from(n)).slices(slices);
-                rec.run(kernel, work.flops(flops).bytes(bytes), args);
+                rec.run(kernel, items.slices(slices).flops(flops).bytes(bytes), args);
             }
             Scatter::Owned(kernel) => {
                 let args = hash_grid_backward_owned::Args {
                     levels,
                     points,
                     d_features,
+                    slopes,
+                    d_gradient,
                     d_table,
                     n,
                 };
@@ -319,5 +484,36 @@ impl Field {
                 );
             }
         }
+    }
+
+    /// What the points hear, into `d_points [3, n]`; right after [`Field::backward`], whose scratch memory it reads.
+    pub fn point_backward(
+        &self,
+        rec: &mut Recorder,
+        params: &Params,
+        points: Ptr<f32>,
+        buffers: &FieldBuffers,
+        scratch: &Scratch,
+        d_points: PtrMut<f32>,
+    ) {
+        let (n, slope) = (buffers.n, buffers.slope());
+        let args = field_point_backward::Args {
+            levels: self.levels.ptr(),
+            table: params.values().ptr().offset(self.table),
+            points,
+            d_inputs: scratch.d_inputs.ptr(),
+            slopes: slope.slopes.ptr(),
+            d_gradient: slope.d_gradient.ptr(),
+            d_points,
+            n,
+        };
+        let work = Work::items(u64::from(n)).flops(8.0 * self.interpolation_flops());
+        let bytes = self.gather_bytes() + 8.0 * f64::from(self.shape.inputs());
+        rec.run(&self.kernels().points, work.bytes(bytes), args);
+    }
+
+    fn kernels(&self) -> &GradientKernels {
+        let kernels = self.by_chain_rule.as_ref();
+        kernels.expect("a field that was built with a gradient")
     }
 }

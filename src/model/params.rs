@@ -59,6 +59,13 @@ pub struct WeightHandle {
     pub bias: Option<u64>,
 }
 
+impl WeightHandle {
+    /// The matrix alone.
+    pub fn without_bias(self) -> WeightHandle {
+        WeightHandle { bias: None, ..self }
+    }
+}
+
 /// Where a matrix stands.
 #[derive(Clone, Copy, Debug)]
 pub enum WeightAt {

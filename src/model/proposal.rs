@@ -40,6 +40,7 @@ impl Proposal {
             hidden: s.proposal_hidden,
             coordinates: false,
             softplus: false,
+            gradient: false,
         }
     }
 

@@ -6,15 +6,17 @@ use super::hash_grid::HashGrid;
 use super::layer::{Activation, Layer, LayerShape};
 use super::params::{Draws, Group, Init, Params, ParamsPlan};
 use crate::Result;
-use crate::config::Config;
+use crate::config::{Config, GradientKind};
 use crate::gpu::{Buffer, Gpu, Kernel, Ptr, PtrMut, Recorder, Work};
 use crate::kernels::{appearance_backward, shade_backward, shade_forward, sigmoid_backward};
 
 /// Parameters and kernels of the surface's networks.
 pub struct Surface {
     pub field: Field,
-    /// The same field under a name of its own in the profile: the extra points of bias correction.
+    /// The same field, without gradient, under a name of its own in the profile: the extra points of bias correction.
     pub probes: Field,
+    /// The same field under a name of its own in the profile: the extra points of the tangent-normal loss.
+    beside: Option<Field>,
     heads: Layer,
     colors: Vec<Layer>,
     appearance: u64,
@@ -28,13 +30,13 @@ pub struct Surface {
     tap_floor: f32,
 }
 
-/// Activations of the surface at `n` samples and their six taps.
+/// Activations of the surface at `n` samples and where the gradient comes from taps at six points around each: 1 or 7 blocks of points.
 pub struct SurfaceBuffers {
     pub n: u32,
-    pub points: Buffer<f32>,  // [3, 7n] samples, then taps +x −x +y −y +z −z
-    pub field: FieldBuffers,  // of the 7n points
-    pub sdf: Buffer<f32>,     // [7, n]
-    pub d_sdf: Buffer<f32>,   // [7, n]
+    pub points: Buffer<f32>, // [3, blocks * n] samples, then taps +x −x +y −y +z −z
+    pub field: FieldBuffers, // of all points
+    pub sdf: Buffer<f32>,    // [blocks, n]
+    pub d_sdf: Buffer<f32>,  // [blocks, n]
     pub shading: Buffer<f32>, // [rows, n] glsl/lib/shading.glsl; row 0 is the scale logit
     pub d_shading: Buffer<f32>, // [rows that receive gradients, n]
     pub hidden: Vec<Buffer<f32>>, // per hidden colour layer [width, n]
@@ -70,6 +72,7 @@ impl Surface {
             hidden: config.surface.hidden,
             coordinates: true,
             softplus: true,
+            gradient: config.surface.gradient == GradientKind::Analytic,
         }
     }
 
@@ -173,7 +176,25 @@ impl Surface {
         };
         Ok(Surface {
             field: Field::new(gpu, "surface", shape, table, hidden_weight, heads_weight)?,
-            probes: Field::new(gpu, "bias", shape, table, hidden_weight, heads_weight)?,
+            probes: Field::new(
+                gpu,
+                "bias",
+                shape.without_gradient(),
+                table,
+                hidden_weight,
+                heads_weight,
+            )?,
+            beside: match shape.gradient {
+                true => Some(Field::new(
+                    gpu,
+                    "tangent",
+                    shape,
+                    table,
+                    hidden_weight,
+                    heads_weight,
+                )?),
+                false => None,
+            },
             heads: Layer::new(gpu, "heads", head_shape, heads_weight)?,
             colors,
             appearance,
@@ -182,10 +203,12 @@ impl Surface {
             shade_forward: gpu.kernel(shade_forward::Shape {
                 geometry,
                 appearance: appearance_dims,
+                analytic: u32::from(shape.gradient),
             })?,
             shade_backward: gpu.kernel(shade_backward::Shape {
                 geometry,
                 appearance: appearance_dims,
+                analytic: u32::from(shape.gradient),
             })?,
             sigmoid_backward: gpu.kernel(sigmoid_backward::Shape::default())?,
             appearance_backward: gpu.kernel(appearance_backward::Shape::default())?,
@@ -199,13 +222,31 @@ impl Surface {
         (self.tap_range, self.tap_floor)
     }
 
+    /// The field that the tangent-normal loss asks.
+    ///
+    /// # Panics
+    /// If the configuration's gradient is not analytic.
+    pub fn beside(&self) -> &Field {
+        self.beside.as_ref().expect("a field with a gradient")
+    }
+
+    /// Points per sample: 1, or 7 with taps.
+    pub fn blocks(&self) -> u32 {
+        Self::blocks_of(&self.field.shape)
+    }
+
+    /// As [`Surface::blocks`], before there is a surface.
+    pub fn blocks_of(shape: &FieldShape) -> u32 {
+        if shape.gradient { 1 } else { 7 }
+    }
+
     fn gradient_rows(&self) -> u32 {
         1 + self.geometry + 3 + self.appearance_dims
     }
 
     /// Buffers for `n` samples.
     pub fn buffers(&self, gpu: &Gpu, n: u32) -> Result<SurfaceBuffers> {
-        let n64 = u64::from(n);
+        let (n64, blocks) = (u64::from(n), self.blocks());
         let width = |layer: usize| self.colors[layer].outputs();
         let hidden_layers = self.colors.len() - 1;
         let layer_buffers = |name: &str| -> Result<Vec<Buffer<f32>>> {
@@ -216,10 +257,10 @@ impl Surface {
         let rows = u64::from(self.gradient_rows() + 3 + DIRECTION_ENCODING);
         Ok(SurfaceBuffers {
             n,
-            points: gpu.scratch("surface points", 3 * 7 * n64)?,
-            field: FieldBuffers::new(gpu, "surface", &self.field.shape, 7 * n, n)?,
-            sdf: gpu.scratch("sdf", 7 * n64)?,
-            d_sdf: gpu.scratch("d_sdf", 7 * n64)?,
+            points: gpu.scratch("surface points", 3 * u64::from(blocks) * n64)?,
+            field: FieldBuffers::new(gpu, "surface", &self.field.shape, blocks * n, n)?,
+            sdf: gpu.scratch("sdf", u64::from(blocks) * n64)?,
+            d_sdf: gpu.scratch("d_sdf", u64::from(blocks) * n64)?,
             shading: gpu.scratch("shading", rows * n64)?,
             d_shading: gpu.scratch("d_shading", u64::from(self.gradient_rows()) * n64)?,
             hidden: layer_buffers("color hidden")?,
@@ -240,11 +281,20 @@ impl Surface {
     ) {
         self.field
             .forward(rec, params, b.points.ptr(), &b.field, b.sdf.ptr_mut());
+        // Nobody reads it where there are taps.
+        let gradient = match self.field.shape.gradient {
+            true => {
+                self.field.gradient(rec, params, b.points.ptr(), &b.field);
+                b.field.slope().gradient.ptr()
+            }
+            false => b.sdf.ptr(),
+        };
         self.heads
             .forward(rec, params, b.field.hidden.ptr(), b.shading.ptr_mut(), b.n);
         let args = shade_forward::Args {
             sdf: b.sdf.ptr(),
             tap_draws: inputs.tap_draws,
+            gradient,
             points: b.points.ptr(),
             directions: inputs.directions,
             ray_view: inputs.ray_view,
@@ -305,6 +355,10 @@ impl Surface {
             d_shading: b.d_shading.ptr(),
             tap_draws: inputs.tap_draws,
             d_sdf: b.d_sdf.ptr_mut(),
+            d_gradient: match self.field.shape.gradient {
+                true => b.field.slope().d_gradient.ptr_mut(),
+                false => b.d_sdf.ptr_mut(),
+            },
             n,
             tap_range: self.tap_range,
             tap_floor: self.tap_floor,

@@ -1,19 +1,21 @@
 //! What is wrong with a batch: colour, eikonal, interlevel and bias losses, their sums for the log (METHOD 4).
 
 use super::composite::{Composite, Look};
+use super::tangent::Tangent;
 use crate::Result;
 use crate::config::{BiasReduction, Config};
 use crate::gpu::{Buffer, Gpu, Kernel, Ptr, Recorder, Work};
 use crate::kernels::{LossTerm, bias_correction, color_loss, heaviest_sample, sum_losses};
 use crate::model::{FieldBuffers, Model, Scratch, Surface};
 
-/// Names of the summed terms, in order; the total of the first five follows as the last number.
-pub const TERMS: [&str; 7] = [
+/// Names of the summed terms, in order; the total of the first six follows as the last number.
+pub const TERMS: [&str; 8] = [
     "color",
     "eikonal",
     "interlevel_0",
     "interlevel_1",
     "bias",
+    "tangent",
     "mse",
     "crossing",
 ];
@@ -33,6 +35,7 @@ pub struct Loss {
     query_field: FieldBuffers,
     query_sdf: Buffer<f32>,   // [2, n_rays]
     d_query_sdf: Buffer<f32>, // [2, n_rays]
+    pub tangent: Option<Tangent>,
     terms: Buffer<LossTerm>,
     color_loss: Kernel<color_loss::Args>,
     heaviest_sample: Kernel<heaviest_sample::Args>,
@@ -51,6 +54,7 @@ pub struct Loss {
 pub struct LossScales {
     pub eikonal: f32,
     pub interlevel: f32,
+    pub tangent: f32,
 }
 
 impl Loss {
@@ -72,12 +76,13 @@ impl Loss {
             query_field: FieldBuffers::new(
                 gpu,
                 "bias",
-                &Surface::field_shape(config),
+                &Surface::field_shape(config).without_gradient(),
                 2 * n_rays,
                 0,
             )?,
             query_sdf: gpu.scratch("bias sdf", 2 * n)?,
             d_query_sdf: gpu.scratch("bias d_sdf", 2 * n)?,
+            tangent: Tangent::new(gpu, config, n_rays * config.sampling.samples)?,
             terms: gpu.buffer("loss terms", TERMS.len() as u64)?,
             color_loss: gpu.kernel(color_loss::Shape::default())?,
             heaviest_sample: gpu.kernel(heaviest_sample::Shape::default())?,
@@ -203,6 +208,10 @@ impl Loss {
             term(interlevel[0].ptr(), n, weights.interlevel * per_ray, 1),
             term(interlevel[1].ptr(), n, weights.interlevel * per_ray, 1),
             term(self.bias.ptr(), n, 1.0, 1), // weighted where it is computed: its weight changes with time
+            match &self.tangent {
+                Some(tangent) => term(tangent.loss.ptr(), n_all, weights.tangent / n_all as f32, 1),
+                None => term(self.bias.ptr(), 0, 0.0, 1),
+            },
             term(self.square.ptr(), n, per_ray, 0),
             term(self.gate.ptr(), n, per_ray, 0),
         ];

@@ -5,6 +5,7 @@ mod loss;
 mod rays;
 mod renderer;
 mod sampler;
+mod tangent;
 
 pub use composite::{Composite, Look};
 pub use loss::{Loss, LossScales, TERMS};

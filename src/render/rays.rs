@@ -3,7 +3,7 @@
 use glam::{DMat4, DVec3};
 
 use crate::Result;
-use crate::config::{Config, MaskUse};
+use crate::config::{Config, GradientKind, MaskUse};
 use crate::gpu::{Buffer, Gpu, Kernel, Ptr, Recorder, Work};
 use crate::kernels::{self, draw_rays, draw_uniforms, view_rays};
 use crate::model::Background;
@@ -148,7 +148,8 @@ fn view_row(
 pub struct RayDraws {
     pub all: Buffer<f32>,
     n_rays: u64,
-    n_samples: u64,
+    /// Draws for all samples of a ray.
+    for_samples: u64,
     kernel: Kernel<draw_uniforms::Args>,
     seed: u32,
 }
@@ -156,12 +157,17 @@ pub struct RayDraws {
 impl RayDraws {
     /// Room for the draws of a batch.
     pub fn new(gpu: &Gpu, config: &Config, n_rays: u32) -> Result<RayDraws> {
-        let (n_rays, n_samples) = (u64::from(n_rays), u64::from(config.sampling.samples));
-        let per_ray = 3 + 3 + n_samples + u64::from(Background::draws_per_ray(config));
+        let n_rays = u64::from(n_rays);
+        let for_samples = u64::from(config.sampling.samples)
+            * match config.surface.gradient {
+                GradientKind::Taps => 1,
+                GradientKind::Analytic => 2,
+            };
+        let per_ray = 3 + 3 + for_samples + u64::from(Background::draws_per_ray(config));
         Ok(RayDraws {
             all: gpu.scratch("draws", n_rays * per_ray)?,
             n_rays,
-            n_samples,
+            for_samples,
             kernel: gpu.kernel(draw_uniforms::Shape::default())?,
             seed: config.seed,
         })
@@ -190,14 +196,14 @@ impl RayDraws {
         self.all.ptr().offset((3 + level) * self.n_rays)
     }
 
-    /// `[n_rays, n_samples]` tap distances.
-    pub fn taps(&self) -> Ptr<f32> {
+    /// `[n_rays, n_samples]` tap distances; with the analytic gradient `[2, n_rays, n_samples]` directions of the tangent-normal loss.
+    pub fn per_sample(&self) -> Ptr<f32> {
         self.all.ptr().offset(6 * self.n_rays)
     }
 
     /// `[n_rays, background samples + 1]` jitter of the background's edges.
     pub fn background(&self) -> Ptr<f32> {
-        self.all.ptr().offset((6 + self.n_samples) * self.n_rays)
+        self.all.ptr().offset((6 + self.for_samples) * self.n_rays)
     }
 }
 

@@ -81,7 +81,7 @@ impl Renderer {
     /// What shading reads beside the points.
     pub fn shade_inputs(&self) -> ShadeInputs {
         ShadeInputs {
-            tap_draws: self.draws.taps(),
+            tap_draws: self.draws.per_sample(),
             directions: self.rays.directions.ptr(),
             ray_view: self.rays.view.ptr(),
             n_rays: self.rays.n,

@@ -49,7 +49,7 @@ impl Sampler {
         self.levels.get(level).map_or(&self.edges, |b| &b.edges)
     }
 
-    /// Places the shading samples: `self.edges`, and into `points` the bin starts with their six taps. Without `train`, no jitter.
+    /// Places the shading samples: `self.edges`, and into `points` the bin starts with their taps, if any. Without `train`, no jitter.
     #[allow(clippy::too_many_arguments)] // what a pass over the rays needs; a struct would only rename them
     pub fn place(
         &self,
@@ -125,11 +125,11 @@ impl Sampler {
             directions: rays.directions.ptr(),
             near_far: rays.near_far.ptr(),
             edges: self.edges.ptr(),
-            tap_draws: draws.taps(),
+            tap_draws: draws.per_sample(),
             points: points.ptr_mut(),
             n,
             n_samples: self.n_samples,
-            n_blocks: 7,
+            n_blocks: model.surface.blocks(),
             tap_range,
             tap_floor,
         };

@@ -99,6 +99,7 @@ impl Trainer {
         let scales = LossScales {
             eikonal: config.loss.eikonal as f32,
             interlevel: config.loss.interlevel as f32,
+            tangent: config.loss.tangent as f32,
         };
         loss.set_terms(
             gpu,
@@ -108,7 +109,10 @@ impl Trainer {
         )?;
         let s = &config.sampling;
         let mut users = vec![
-            (Surface::field_shape(config), 7 * n_rays * s.samples),
+            (
+                Surface::field_shape(config),
+                Surface::blocks_of(&Surface::field_shape(config)) * n_rays * s.samples,
+            ),
             (
                 Proposal::field_shape(config, 0),
                 n_rays * s.proposal_samples[0],
@@ -133,7 +137,7 @@ impl Trainer {
             config: config.clone(),
             region: region.clone(),
             preview,
-            step: 0,
+            step: config.first_step,
             rate_factor: 1.0,
             model,
             renderer,
@@ -200,6 +204,9 @@ impl Trainer {
         render
             .composite
             .backward(rec, &look, &model.surface, &loss.d_color);
+        if let Some(tangent) = &loss.tangent {
+            tangent.run(rec, model, &look, &render.draws, &self.scratch);
+        }
         let background_rays = render.background_rays(true);
         model.background.backward(
             rec,
@@ -231,7 +238,7 @@ impl Trainer {
         loss.sum(rec);
     }
 
-    /// Steps done so far.
+    /// Steps done so far, in all stages.
     pub fn steps_done(&self) -> u64 {
         self.step
     }

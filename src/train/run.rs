@@ -21,6 +21,9 @@ use std::time::Instant;
 const BAD_STEPS: u32 = 10;
 const SLOWED: f64 = 0.5;
 
+/// Values, first and second moments.
+const BLOCKS: usize = 3;
+
 /// Key of that factor in a checkpoint's extra state.
 const RATE_FACTOR: &str = "learning_rate_factor";
 
@@ -38,7 +41,8 @@ impl Trainer {
         tell: &mut dyn FnMut(Event) -> Control,
     ) -> Result<()> {
         let began = Instant::now();
-        let steps = self.config.steps;
+        let end = self.config.first_step + self.config.steps;
+        let steps = self.config.total_steps();
         let report = self.config.report.clone();
         let mut stop = false;
         let mut tell = |event: Event| {
@@ -63,7 +67,7 @@ impl Trainer {
         pace.mark(self.step);
         let mut bad = BadSteps::default();
         let mut saved = (self.step, Instant::now());
-        while self.step < steps {
+        while self.step < end {
             self.step()?;
             let step = self.step;
             let mut stopping = tell(Event::Advanced { step, steps });
@@ -80,7 +84,7 @@ impl Trainer {
                     stopping |= tell(told(losses, steps, pace.per_second()));
                 }
             }
-            let last = step == steps;
+            let last = step == end;
             if !stopping && due(step, report.preview_steps, last) {
                 let begun = Instant::now();
                 match self.look(scene, &run.preview(step), &mut || {
@@ -181,6 +185,43 @@ impl Trainer {
         }
     }
 
+    /// The trainer of the stage after this one, or `None` if this was the last. It begins with the parameters of the newest checkpoint,
+    /// which [`Trainer::run`] left at the end of this stage; this stage's memory is freed first.
+    ///
+    /// # Errors
+    /// What [`Trainer::new`] and [`Trainer::begin_from`] fail with.
+    pub fn next_stage(self, scene: &Scene, run: &RunDirectory) -> Result<Option<Trainer>> {
+        let Some(config) = self.config.second_stage() else {
+            return Ok(None);
+        };
+        let (gpu, region) = (self.gpu.clone(), self.region.clone());
+        drop(self);
+        let mut next = Trainer::new(&gpu, scene, &region, &config)?;
+        next.begin_from(&checkpoint::latest(&run.checkpoints())?.checkpoint)?;
+        Ok(Some(next))
+    }
+
+    /// Takes the parameters, and nothing else, of the checkpoint at the end of the stage before this one (METHOD 1.4).
+    ///
+    /// # Errors
+    /// [`Error::Input`] if it is not the end of that stage, or of another model or region; what writing device memory fails with.
+    pub fn begin_from(&mut self, checkpoint: &Checkpoint) -> Result<()> {
+        let state = checkpoint.state();
+        if state.step != self.config.first_step {
+            return Err(Error::input(
+                checkpoint.path(),
+                format!(
+                    "is of step {}; the stage before this one ends with step {}",
+                    state.step, self.config.first_step
+                ),
+                "finish that stage first, with --resume",
+            ));
+        }
+        self.take(checkpoint, 1)?;
+        self.step = state.step;
+        Ok(())
+    }
+
     /// Writes a checkpoint of everything that later steps depend on into `folder`; see [`checkpoint::save`].
     ///
     /// # Errors
@@ -216,20 +257,8 @@ impl Trainer {
     /// # Errors
     /// [`Error::Input`] if the tensors do not fit; what writing device memory fails with.
     pub fn restore(&mut self, checkpoint: &Checkpoint) -> Result<()> {
+        self.take(checkpoint, BLOCKS)?;
         let state = checkpoint.state();
-        if state.region != self.region {
-            return Err(Error::input(
-                checkpoint.path(),
-                "belongs to another region than this run's",
-                "resume without changing the region, or begin a new run",
-            ));
-        }
-        for (tensor, buffer, first) in self.parts() {
-            checkpoint.read(&tensor, &mut |offset, numbers| {
-                self.gpu.upload(buffer, first + offset, numbers)
-            })?;
-        }
-        self.gpu.finish()?;
         self.step = state.step;
         let factor = state.extra.get(RATE_FACTOR);
         self.rate_factor = factor.and_then(|text| text.parse().ok()).unwrap_or(1.0);
@@ -237,10 +266,29 @@ impl Trainer {
         Ok(())
     }
 
+    /// Reads the first `blocks` of values and moments.
+    fn take(&mut self, checkpoint: &Checkpoint, blocks: usize) -> Result<()> {
+        if checkpoint.state().region != self.region {
+            return Err(Error::input(
+                checkpoint.path(),
+                "belongs to another region than this run's",
+                "resume without changing the region, or begin a new run",
+            ));
+        }
+        let parts = self.parts();
+        let n_tensors = parts.len() / BLOCKS * blocks;
+        for (tensor, buffer, first) in parts.into_iter().take(n_tensors) {
+            checkpoint.read(&tensor, &mut |offset, numbers| {
+                self.gpu.upload(buffer, first + offset, numbers)
+            })?;
+        }
+        self.gpu.finish()
+    }
+
     /// What a checkpoint holds: parameters and their moments, each with its place on the device.
     fn parts(&self) -> Vec<(Tensor, &Buffer<f32>, u64)> {
         let params = &self.model.params;
-        let blocks = [
+        let blocks: [_; BLOCKS] = [
             ("", params.values()),
             ("first_moment.", params.first_moment()),
             ("second_moment.", params.second_moment()),

@@ -1,14 +1,14 @@
 //! Every number that changes with time, as a function of the step alone.
 //!
 //! Closed forms (METHOD 1.2, 1.3), k the time in schedule steps:
-//!   scale bound   1/β ≥ a + (b - a) log₂(1 + min(k, K)/K)
-//!   bias weight   the same form, from `weight_start` to `weight`
+//!   scale bound   A: 1/β ≥ a + (b - a) log₂(1 + min(k, K)/K);  B: a + (b - a) (e^{4x} - 1)/(e⁴ - 1), then on to c with (e^x - 1)/(e - 1)
+//!   bias weight   the form of A, from `weight_start` to `weight`
 //!   annealing     10x / (9x + 1), x = min(k/K, 1): exponent of the proposal weights (Barron et al. 2022)
 //!   multi-step    min(k/warmup, 1) · γ^(milestones passed)
 //!   exponential   a^(1-x) b^x, x = min(k/K, 1)
 //! A run of another length than `schedule_steps` is the same schedule, stretched: k = step · schedule_steps / steps, not rounded.
 
-use crate::config::{Config, Drop, Exponential, MultiStep};
+use crate::config::{Config, Drop, Exponential, MultiStep, Rise, ScaleBound};
 
 /// The schedules of a run.
 #[derive(Clone, Debug)]
@@ -19,7 +19,7 @@ pub struct Schedule {
 /// All annealed numbers of one step.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Now {
-    /// The step that these belong to.
+    /// The step of the stage that these belong to.
     pub step: u64,
     /// Learning rate of the surface and colour networks and the appearance codes.
     pub lr_fields: f64,
@@ -58,15 +58,16 @@ impl Schedule {
         }
     }
 
-    /// Where the schedule stands at a training step (counted from 0): schedule steps, not whole in general.
+    /// Where the schedule stands at a step of the stage (counted from 0): schedule steps, not whole in general.
     pub fn time(&self, step: u64) -> f64 {
         // One rounding only, so that milestones are hit exactly wherever they can be.
         (u128::from(step) * u128::from(self.config.schedule_steps)) as f64
             / self.config.steps as f64
     }
 
-    /// The numbers for a training step, counted from 0. Beyond the end of the run they stay as at its end.
+    /// The numbers for a step, counted from the beginning of the first stage. Beyond the end of the stage they stay as at its end.
     pub fn at(&self, step: u64) -> Now {
+        let step = step.saturating_sub(self.config.first_step);
         let k = self.time(step.min(self.config.steps));
         let Config {
             sampling,
@@ -76,7 +77,6 @@ impl Schedule {
             ..
         } = &self.config;
         let bias = &loss.bias;
-        let bound = &loss.scale_bound;
         Now {
             step,
             lr_fields: multi_step(&optimizer.fields, k),
@@ -84,7 +84,7 @@ impl Schedule {
             lr_proposal: multi_step(&optimizer.proposal, k),
             lr_background: exponential(&optimizer.background, k / *schedule_steps as f64),
             anneal: anneal(k / sampling.anneal_steps as f64),
-            inv_s_lower: logarithmic(bound.start, bound.end, bound.steps, k),
+            inv_s_lower: scale_bound(&loss.scale_bound, k),
             bias_weight: logarithmic(bias.weight_start, bias.weight, bias.ramp_steps, k),
         }
     }
@@ -96,6 +96,22 @@ fn logarithmic(start: f64, end: f64, steps: u64, k: f64) -> f64 {
         return end;
     }
     start + (end - start) * (1.0 + k / steps as f64).log2()
+}
+
+fn scale_bound(bound: &ScaleBound, k: f64) -> f64 {
+    let beyond = k - bound.steps as f64;
+    if beyond >= 0.0 && bound.last_steps > 0 {
+        return exponential_rise(bound.end, bound.last, beyond / bound.last_steps as f64, 1.0);
+    }
+    match bound.rise {
+        Rise::Logarithmic => logarithmic(bound.start, bound.end, bound.steps, k),
+        Rise::Exponential => exponential_rise(bound.start, bound.end, k / bound.steps as f64, 4.0),
+    }
+}
+
+/// From `start` to `end` while x goes from 0 to 1, as (e^{rate x} − 1)/(e^rate − 1): fast last.
+fn exponential_rise(start: f64, end: f64, x: f64, rate: f64) -> f64 {
+    start + (end - start) * (rate * x.min(1.0)).exp_m1() / rate.exp_m1()
 }
 
 fn anneal(x: f64) -> f64 {
