@@ -1,7 +1,7 @@
 //! The golden training steps of both stages: a batch of eight rays through the whole of the authors' model.
 
 use crate::assert_close;
-use crate::reference::batch::{Stage, Step};
+use crate::reference::batch::Stage;
 use crate::reference::npz::Npz;
 use crate::reference::{golden, sampling};
 
@@ -22,7 +22,7 @@ fn whole_step_of_stage_2() {
 
 /// A whole stage on a small batch: samples, fields, image, losses, and the gradient of every parameter.
 fn check_whole_step(npz: &Npz, stage: &Stage, own_loss: (&str, &str)) {
-    let step: Step = golden::whole_step(npz);
+    let step = golden::whole_step(npz);
     let outcome = step.run_stage(stage);
     let images = &outcome.images;
     let samples = step.config.samples;
