@@ -3,11 +3,13 @@
 mod reference;
 
 use reference::background::{self, Background};
-use reference::batch::{Outcome, Step};
+use reference::batch::{Outcome, Stage, Step, StepConfig};
 use reference::hash_grid::Grid;
-use reference::losses::BiasReduction;
-use reference::networks::spherical_harmonics;
+use reference::losses::{self, BiasReduction};
+use reference::networks::{NormedLayer, spherical_harmonics};
 use reference::sampling::{self, Region, Stretch};
+use reference::surface::{self, Surface};
+use reference::tape::Tape;
 use reference::trial::{self, Random};
 
 /// What a span's gradient belongs to. No gradient flows from the interlevel loss through the final weights, which it takes as they
@@ -23,8 +25,8 @@ fn objective(outcome: &Outcome, span: &str) -> f64 {
 
 /// Compares sampled gradients of every span with central differences of step 1e-6, at fixed sample positions (no gradient flows
 /// through those). The seeds are such that no sampled difference straddles a kink (ReLU, |C − target|, the hinges, the heaviest sample).
-fn check_gradients(mut step: Step, seed: u64) {
-    let outcome = step.run();
+fn check_gradients(mut step: Step, stage: &Stage, seed: u64) {
+    let outcome = step.run_stage(stage);
     step.edges = Some(outcome.images.edges.clone());
     for (name, loss) in &outcome.losses {
         assert!(*loss > 0.0, "the {name} loss is {loss}: nothing is tested");
@@ -51,7 +53,7 @@ fn check_gradients(mut step: Step, seed: u64) {
             let value = step.params[&span][i];
             let mut at = |value: f64| {
                 step.params.get_mut(&span).expect("a span")[i] = value;
-                objective(&step.run(), &span)
+                objective(&step.run_stage(stage), &span)
             };
             let difference = (at(value + 1e-6) - at(value - 1e-6)) / 2e-6;
             at(value);
@@ -69,27 +71,36 @@ fn check_gradients(mut step: Step, seed: u64) {
 
 #[test]
 fn gradients_outdoors_with_one_background_color() {
-    check_gradients(trial::step(trial::config(), 24, 1), 2);
+    check_gradients(trial::step(trial::config(), 24, 1), &Stage::Taps, 2);
 }
 
 #[test]
 fn gradients_outdoors_with_a_background_field() {
     for contraction in [true, false] {
-        let field = background::FieldConfig {
-            contraction,
-            ..trial::background_field()
-        };
-        let config = reference::batch::StepConfig {
-            background: Background::Field(field),
-            ..trial::config()
-        };
-        check_gradients(trial::step(config, 24, 3), 4);
+        let step = trial::step(with_background_field(contraction), 24, 3);
+        check_gradients(step, &Stage::Taps, 4);
+    }
+}
+
+fn with_background_field(contraction: bool) -> StepConfig {
+    let field = background::FieldConfig {
+        contraction,
+        ..trial::background_field()
+    };
+    StepConfig {
+        background: Background::Field(field),
+        ..trial::config()
     }
 }
 
 #[test]
 fn gradients_indoors() {
-    let config = reference::batch::StepConfig {
+    check_gradients(indoors(), &Stage::Taps, 6);
+}
+
+/// A step whose scale bound holds for half of the samples.
+fn indoors() -> Step {
+    let config = StepConfig {
         region: Region::Box {
             half: [1.0, 0.7, 0.8],
         },
@@ -102,11 +113,131 @@ fn gradients_indoors() {
         ..trial::config()
     };
     let mut step = trial::step(config, 16, 5);
-    // A bound that holds for half of the samples.
     let mut scales = step.run().images.inv_s;
     scales.sort_by(f64::total_cmp);
     step.now.inv_s_lower = scales[scales.len() / 2];
-    check_gradients(step, 6);
+    step
+}
+
+#[test]
+fn gradients_of_stage_2_outdoors_with_one_background_color() {
+    let step = trial::step(trial::config(), 24, 11);
+    let stage = trial::second_stage(&step, 12);
+    check_gradients(step, &stage, 13);
+}
+
+#[test]
+fn gradients_of_stage_2_outdoors_with_a_background_field() {
+    let step = trial::step(with_background_field(true), 24, 14);
+    let stage = trial::second_stage(&step, 15);
+    check_gradients(step, &stage, 16);
+}
+
+#[test]
+fn gradients_of_stage_2_indoors() {
+    let step = indoors();
+    let stage = trial::second_stage(&step, 17);
+    check_gradients(step, &stage, 18);
+}
+
+/// Beyond the bound an angle is that of the bound and has no gradient; a gradient of no length has no direction, but a derivative.
+#[test]
+fn tangent_loss_at_its_edges() {
+    let tape = &mut Tape::default();
+    let normals = tape.parameter(3, 3, [[0.6, 0.8, 0.0]; 3].concat());
+    let others = [[0.6, 0.8, 0.0], [-0.6, -0.8, 0.0], [0.0, 0.0, 1.0]];
+    let others = tape.parameter(3, 3, others.concat());
+    let loss = losses::tangent(tape, normals, others);
+    assert!((tape.scalar(loss) - 0.5).abs() < 1e-15);
+    let gradients = tape.backward(loss);
+    for (d, other) in [
+        (gradients.get(normals), [0.0, 0.0, 1.0]),
+        (gradients.get(others), [0.6, 0.8, 0.0]),
+    ] {
+        assert_eq!(d[..6], [0.0; 6]);
+        let expected = other.map(|other| -other / (3.0 * std::f64::consts::PI));
+        for (d, expected) in d[6..].iter().zip(expected) {
+            assert!((d - expected).abs() < 1e-15, "{d}, expected {expected}");
+        }
+    }
+
+    let short = tape.parameter(1, 3, vec![0.0; 3]);
+    let normal = surface::normals(tape, short);
+    assert_eq!(tape.value(normal), [0.0; 3]);
+    let d = tape.backward_with(normal, &[1.0, 2.0, 3.0]).get(short);
+    assert_eq!(d, [1.0, 2.0, 3.0].map(|d| d / 1e-12));
+}
+
+/// The explicit formula of g is the derivative of f, and its own derivative by x that of central differences.
+#[test]
+fn analytic_gradient_of_the_surface() {
+    let step = trial::step(trial::config(), 6, 19);
+    let points: Vec<[f64; 3]> = step.run().images.points;
+    let at = |points: &[[f64; 3]]| {
+        let tape = &mut Tape::default();
+        let mut put = |name: &str| {
+            let (_, rows, cols) = (step.config.spans().into_iter())
+                .find(|(span, _, _)| span == name)
+                .expect("a span");
+            tape.constant(rows, cols, step.params[name].clone())
+        };
+        let mut layer = |name: &str| NormedLayer {
+            v: put(&format!("{name}.v")),
+            g: put(&format!("{name}.g")),
+            bias: put(&format!("{name}.bias")),
+        };
+        let field = Surface {
+            hidden: layer("surface.hidden"),
+            heads: layer("surface.heads"),
+            table: put("surface.table"),
+        };
+        let x = tape.parameter(points.len(), 3, points.as_flattened().to_vec());
+        let (heads, gradient) = field.heads_and_gradient(tape, &step.config.grid, x);
+        let sdf = tape.columns(heads, 0..1);
+        let by_tape = tape.backward_with(sdf, &vec![1.0; points.len()]).get(x);
+        let h = [0.3, -0.8, 0.5].repeat(points.len());
+        let bend = tape.backward_with(gradient, &h).get(x);
+        let along: Vec<f64> = (tape.value(gradient).chunks_exact(3).zip(h.chunks_exact(3)))
+            .map(|(g, h)| g[0] * h[0] + g[1] * h[1] + g[2] * h[2])
+            .collect();
+        (tape.value(gradient).to_vec(), by_tape, along, bend)
+    };
+    let (gradient, by_tape, _, bend) = at(&points);
+    for (a, b) in gradient.iter().zip(&by_tape) {
+        assert!((a - b).abs() < 1e-12 * (1.0 + b.abs()), "g {a}, ∂f/∂x {b}");
+    }
+    for axis in 0..3 {
+        let moved = |step: f64| {
+            let mut points = points.clone();
+            points.iter_mut().for_each(|x| x[axis] += step);
+            at(&points).2
+        };
+        for (i, (above, below)) in moved(1e-6).iter().zip(moved(-1e-6)).enumerate() {
+            let (difference, bend) = ((above - below) / 2e-6, bend[i * 3 + axis]);
+            assert!(
+                (difference - bend).abs() <= 1e-5 + 1e-5 * bend.abs(),
+                "∂(h·g)/∂x: {bend}, central difference {difference}"
+            );
+        }
+    }
+}
+
+#[test]
+fn given_points_are_taken_as_they_are() {
+    let mut step = trial::step(trial::config(), 6, 20);
+    let second = trial::second_stage(&step, 21);
+    for stage in [Stage::Taps, second] {
+        step.points = None;
+        let own = step.run_stage(&stage);
+        step.points = Some(own.images.points.clone());
+        let given = step.run_stage(&stage);
+        assert_eq!(given.losses, own.losses);
+        assert_eq!(given.gradients, own.gradients);
+        // The last points are the last ray's outermost taps, or its last shifted point.
+        let last = step.points.as_mut().and_then(|points| points.last_mut());
+        last.expect("points")[0] += 0.05;
+        assert_ne!(step.run_stage(&stage).losses, own.losses);
+    }
 }
 
 #[test]

@@ -1,16 +1,29 @@
-//! The golden training step of stage 1: a batch of eight rays through the whole of the authors' model.
+//! The golden training steps of both stages: a batch of eight rays through the whole of the authors' model.
 
 use crate::assert_close;
+use crate::reference::batch::Stage;
+use crate::reference::npz::Npz;
 use crate::reference::{golden, sampling};
 
-/// The whole of stage 1 on a small batch: samples, fields, image, losses, and the gradient of every parameter.
 #[test]
-fn whole_step() {
-    let Some(npz) = golden::open("e2e_stage1") else {
-        return;
-    };
-    let step = golden::whole_step(&npz);
-    let outcome = step.run();
+fn whole_step_of_stage_1() {
+    if let Some(npz) = golden::open("e2e_stage1") {
+        check_whole_step(&npz, &Stage::Taps, ("bias", "loss_back_pts_negative_loss"));
+    }
+}
+
+#[test]
+fn whole_step_of_stage_2() {
+    if let Some(npz) = golden::open("e2e_stage2") {
+        let own_loss = ("tangent", "loss_tangent_normal_consistent_loss");
+        check_whole_step(&npz, &golden::second_stage(&npz), own_loss);
+    }
+}
+
+/// A whole stage on a small batch: samples, fields, image, losses, and the gradient of every parameter.
+fn check_whole_step(npz: &Npz, stage: &Stage, own_loss: (&str, &str)) {
+    let step = golden::whole_step(npz);
+    let outcome = step.run_stage(stage);
     let images = &outcome.images;
     let samples = step.config.samples;
 
@@ -74,7 +87,7 @@ fn whole_step() {
         ("color", "loss_rgb_loss"),
         ("eikonal", "loss_eikonal_loss"),
         ("interlevel", "loss_interlevel_loss"),
-        ("bias", "loss_back_pts_negative_loss"),
+        own_loss,
         ("total", "loss_total"),
     ];
     for (ours, theirs) in names {

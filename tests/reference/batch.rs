@@ -7,6 +7,25 @@ use super::sampling::{Region, Stretch};
 use super::tape::ReluEdge;
 use std::collections::BTreeMap;
 
+/// The stages are told apart by where g, the signed distance's gradient, comes from.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Stage {
+    /// Stage 1: stochastic six taps; the density is that of f; the bias loss.
+    Taps,
+    /// Stage 2: analytic; the density is that of f/|g·d|; the tangent loss in place of the bias loss.
+    Analytic(Tangent),
+}
+
+/// The tangent loss: how far a normal turns within a small shift in the tangent plane.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Tangent {
+    pub weight: f64,
+    /// Length of the longest shift.
+    pub step: f64,
+    /// Gaussian draws, one per shading sample, `[N · S]`; normalised they are uniform on the sphere.
+    pub draws: Vec<[f64; 3]>,
+}
+
 /// The shape of everything, and the numbers that do not change with time.
 #[derive(Clone, Debug, PartialEq)]
 pub struct StepConfig {
@@ -65,7 +84,7 @@ pub struct Rays {
 pub struct Draws {
     /// First sampler, first and second resampling: one draw per ray each.
     pub jitter: [Vec<f64>; 3],
-    /// One per shading sample, `[N · S]`.
+    /// One per shading sample, `[N · S]`; stage 2 takes none.
     pub taps: Vec<f64>,
     /// One per edge of the background field, `[N · (samples + 1)]`; empty: edges stay where they are.
     pub background: Vec<f64>,
@@ -93,7 +112,7 @@ pub struct Step {
     pub now: Now,
     /// Normalised edges `[N, bins + 1]` of both proposal levels and the final one, to be taken as they are.
     pub edges: Option<[Vec<f64>; 3]>,
-    /// The surface's points `[7 · N · S]`, likewise: rounded to float32, a point moves by a ten-thousandth of a fine cell.
+    /// The surface's points, `[7 · N · S]` or in stage 2 `[2 · N · S]`, likewise: rounded to float32, a point moves by a ten-thousandth of a fine cell.
     pub points: Option<Vec<[f64; 3]>>,
     pub relu_edge: ReluEdge,
 }
@@ -109,9 +128,9 @@ pub struct Images {
     /// Log densities `[N, bins]` and weights `[N, bins]` of the proposal levels.
     pub proposal_raw: [Vec<f64>; 2],
     pub proposal_weights: [Vec<f64>; 2],
-    /// `[7 · N · S]`: bin starts, then the six tap blocks. Points are x, y, z.
+    /// Bin starts, then the six tap blocks, `[7 · N · S]`; in stage 2 bin starts, then the tangent loss's points, `[2 · N · S]`.
     pub points: Vec<[f64; 3]>,
-    /// Network outputs at `points`, before anything is overwritten for rays outside.
+    /// Network outputs at bin starts and taps, before anything is overwritten for rays outside.
     pub sdf: Vec<f64>,
     /// `[N · S]`
     pub logit: Vec<f64>,
@@ -141,25 +160,31 @@ pub struct Images {
     pub bias_gate: Vec<f64>,
     pub bias_points: Vec<[f64; 3]>,
     pub bias_sdf: Vec<f64>,
+    /// g at the tangent loss's points, `[N, S, 3]`.
+    pub tangent_gradient: Vec<f64>,
 }
 
 /// ∂total/∂(some of [`Images`]), shaped like them.
 #[derive(Clone, Debug, Default)]
 pub struct ActivationGradients {
     pub proposal_raw: [Vec<f64>; 2],
-    /// All seven blocks.
+    /// All seven blocks; in stage 2 bin starts alone.
     pub sdf: Vec<f64>,
     pub logit: Vec<f64>,
+    /// In stage 2 with what comes through the tangent loss's points.
     pub gradient: Vec<f64>,
     pub features: Vec<f64>,
     pub rgb: Vec<f64>,
     pub background: Vec<f64>,
     pub bias_sdf: Vec<f64>,
+    /// By the coordinates of the tangent loss's points, and by g there, `[N, S, 3]`.
+    pub tangent_points: Vec<f64>,
+    pub tangent_gradient: Vec<f64>,
 }
 
 #[derive(Clone, Debug)]
 pub struct Outcome {
-    /// "color", "eikonal", "bias", "interlevel", each with its weight, and their sum "total".
+    /// "color", "eikonal", "bias" or in stage 2 "tangent", "interlevel", each with its weight, and their sum "total".
     pub losses: BTreeMap<String, f64>,
     pub images: Images,
     pub d_images: ActivationGradients,

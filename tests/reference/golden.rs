@@ -1,7 +1,7 @@
 //! The golden vectors (arrays computed with the authors' own code): where they are, and their whole training step as a [`Step`].
 
 use super::background::Background;
-use super::batch::{Draws, Now, Rays, Step, StepConfig};
+use super::batch::{Draws, Now, Rays, Stage, Step, StepConfig, Tangent};
 use super::hash_grid::Grid;
 use super::losses::BiasReduction;
 use super::npz::Npz;
@@ -73,7 +73,7 @@ pub fn table_spans() -> Vec<(String, String)> {
     ]
 }
 
-/// The archive `e2e_stage1` as a step: 12 levels 16 → 1024 of 2^17 entries, proposals 5 levels 16 → 64 and 16 → 256, one fixed
+/// The archive `e2e_stage1` or `e2e_stage2` as a step: 12 levels 16 → 1024 of 2^17 entries, proposals 5 levels 16 → 64 and 16 → 256, one fixed
 /// background colour. Everything else is read from the arrays.
 pub fn whole_step(npz: &Npz) -> Step {
     let bins = |level: usize| npz.shape(&format!("edges_s{level}"))[1] - 1;
@@ -143,7 +143,9 @@ pub fn whole_step(npz: &Npz) -> Step {
     let jitter = ["draw0_rand", "draw1_rand", "draw2_rand"].map(|draw| npz.values(draw).to_vec());
     let draws = Draws {
         jitter,
-        taps: npz.values("draw3_rand").to_vec(),
+        taps: npz
+            .find("draw3_rand")
+            .map_or(Vec::new(), |taps| taps.values.clone()),
         background: Vec::new(),
     };
     Step {
@@ -156,4 +158,13 @@ pub fn whole_step(npz: &Npz) -> Step {
         points: None,
         relu_edge: ReluEdge::default(),
     }
+}
+
+/// Stage 2 of the archive `e2e_stage2`.
+pub fn second_stage(npz: &Npz) -> Stage {
+    Stage::Analytic(Tangent {
+        weight: 0.005,
+        step: 0.01,
+        draws: npz.vectors("draw3_randn"),
+    })
 }

@@ -263,12 +263,9 @@ pub fn growth(levels: usize, base: u32, max: u32) -> f64 {
 /// e(u) for u `[n, 3]` and a table `[entries, features]`: `[n, width]`.
 pub fn encode(tape: &mut Tape, grid: &Grid, table: Var, u: Var) -> Var {
     assert_eq!((table.len(), u.cols), (grid.parameters(), 3));
-    let point = move |tape: &Tape, row: usize| -> [f64; 3] {
-        std::array::from_fn(|axis| tape.value(u)[row * 3 + axis])
-    };
     let width = grid.width();
     let value = (0..u.rows)
-        .flat_map(|row| grid.encode(tape.value(table), point(tape, row)))
+        .flat_map(|row| grid.encode(tape.value(table), tape.point(u, row)))
         .collect();
     let grid = grid.clone();
     tape.record(
@@ -278,13 +275,53 @@ pub fn encode(tape: &mut Tape, grid: &Grid, table: Var, u: Var) -> Var {
         &[table, u],
         move |tape, d_encoding, gradients| {
             for (row, d_encoding) in d_encoding.chunks_exact(width).enumerate() {
-                let at = point(tape, row);
+                let at = tape.point(u, row);
                 if let Some(d_table) = gradients.of(table) {
                     grid.add_table_gradient(at, d_encoding, d_table);
                 }
                 if let Some(d_u) = gradients.of(u) {
                     let d_at = grid.point_gradient(tape.value(table), at, d_encoding);
                     (0..3).for_each(|axis| d_u[row * 3 + axis] += d_at[axis]);
+                }
+            }
+        },
+    )
+}
+
+/// (∂e/∂u)ᵀ a for u `[n, 3]` and a `[n, width]`, the spatial derivative of a · e: `[n, 3]`.
+pub fn encoding_slope(tape: &mut Tape, grid: &Grid, table: Var, u: Var, a: Var) -> Var {
+    let width = grid.width();
+    assert_eq!((table.len(), u.cols), (grid.parameters(), 3));
+    assert_eq!((a.rows, a.cols), (u.rows, width));
+    let value = (0..u.rows)
+        .flat_map(|row| {
+            let a = &tape.value(a)[row * width..][..width];
+            grid.point_gradient(tape.value(table), tape.point(u, row), a)
+        })
+        .collect();
+    let grid = grid.clone();
+    tape.record(
+        u.rows,
+        3,
+        value,
+        &[table, u, a],
+        move |tape, d_slope, gradients| {
+            for (row, h) in d_slope.chunks_exact(3).enumerate() {
+                let (at, h) = (tape.point(u, row), [h[0], h[1], h[2]]);
+                let (table_values, along) =
+                    (tape.value(table), &tape.value(a)[row * width..][..width]);
+                if let Some(d_table) = gradients.of(table) {
+                    grid.add_table_gradient_of_slope(at, along, h, d_table);
+                }
+                if let Some(d_u) = gradients.of(u) {
+                    let d_at = grid.point_gradient_of_slope(table_values, at, along, h);
+                    (0..3).for_each(|axis| d_u[row * 3 + axis] += d_at[axis]);
+                }
+                if let Some(d_a) = gradients.of(a) {
+                    let jacobian = grid.jacobian(table_values, at);
+                    for (d_a, slope) in d_a[row * width..].iter_mut().zip(jacobian) {
+                        *d_a += slope.iter().zip(h).map(|(slope, h)| slope * h).sum::<f64>();
+                    }
                 }
             }
         },

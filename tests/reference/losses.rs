@@ -1,6 +1,8 @@
-//! The four losses of stage 1: colour, eikonal, explicit bias correction, interlevel.
+//! The losses: colour, eikonal and interlevel in both stages, explicit bias correction in stage 1, tangent normals in stage 2.
 
+use super::sampling::dot;
 use super::tape::{Tape, Var};
+use std::f64::consts::PI;
 
 /// Per ray: weight · mean over the channels of |C − target|, for C `[n, 3]` and targets (r, g, b, weight). `[n, 1]`.
 pub fn color(tape: &mut Tape, rendered: Var, target: &[[f64; 4]]) -> Var {
@@ -207,6 +209,40 @@ pub fn interlevel(
                 d_proposal[ray * bins + overlap.0..=ray * bins + overlap.1]
                     .iter_mut()
                     .for_each(|d| *d += d_outer);
+            }
+        },
+    )
+}
+
+/// The largest |cosine| that still has a gradient: the angle's slope has a pole at 1.
+const STEEPEST: f64 = 1.0 - 1e-6;
+
+/// Mean over the samples of the angle between the unit vectors a and b `[n, 3]`, in half turns: acos(clamp(a · b))/π.
+pub fn tangent(tape: &mut Tape, a: Var, b: Var) -> Var {
+    let n = a.rows;
+    assert_eq!((a.cols, b.rows, b.cols), (3, n, 3));
+    let cosine = move |tape: &Tape, row: usize| dot(tape.point(a, row), tape.point(b, row));
+    let angle = |row: usize| cosine(tape, row).clamp(-STEEPEST, STEEPEST).acos();
+    let mean = 1.0 / (n as f64 * PI);
+    let value = (0..n).map(angle).sum::<f64>() * mean;
+    tape.record(
+        1,
+        1,
+        vec![value],
+        &[a, b],
+        move |tape, d_loss, gradients| {
+            for row in 0..n {
+                let cosine = cosine(tape, row);
+                if cosine.abs() > STEEPEST {
+                    continue;
+                }
+                let d_cosine = -d_loss[0] * mean / (1.0 - cosine * cosine).sqrt();
+                for (input, other) in [(a, b), (b, a)] {
+                    if let Some(d) = gradients.of(input) {
+                        let other = tape.point(other, row);
+                        (0..3).for_each(|axis| d[row * 3 + axis] += d_cosine * other[axis]);
+                    }
+                }
             }
         },
     )

@@ -1,4 +1,4 @@
-//! The slow twin: NeuRodin's first stage in plain f64, written to be read as the specification that every kernel is tested against.
+//! The slow twin: NeuRodin's training step, of both stages, in plain f64, written to be read as the specification that every kernel is tested against.
 //!
 //! Nothing here knows of the crate or of a device. Arrays are row-major with the component innermost (`[points, 3]`, not the
 //! planar `[3, points]` of the device); sample p of ray r is `r * samples + p`. Derivatives come from a small reverse-mode tape

@@ -91,6 +91,22 @@ pub fn softplus_100(tape: &mut Tape, x: Var) -> Var {
     )
 }
 
+/// The slope of [`softplus_100`], to be differentiated itself.
+pub fn softplus_100_slope(tape: &mut Tape, x: Var) -> Var {
+    let linear = |x: f64| 100.0 * x > 20.0;
+    tape.map(
+        x,
+        move |x| if linear(x) { 1.0 } else { logistic(100.0 * x) },
+        move |x, y| {
+            if linear(x) {
+                0.0
+            } else {
+                100.0 * y * (1.0 - y)
+            }
+        },
+    )
+}
+
 /// max(z, 0) for z = x Wᵀ + b, with slope 0 at 0 unless the tape says otherwise.
 pub fn relu(tape: &mut Tape, z: Var, x: Var, w: Var, bias: Option<Var>) -> Var {
     let edge = tape.relu_edge;
@@ -156,6 +172,27 @@ pub fn geometry_network(tape: &mut Tape, hidden: NormedLayer, heads: NormedLayer
     let z = hidden.apply(tape, x);
     let h = softplus_100(tape, z);
     heads.apply(tape, h)
+}
+
+/// [`geometry_network`], and the derivative of its first output by its input, ∂y₀/∂x = W₁ᵀ (softplus'(z) ⊙ w₂) with w₂ the first row of
+/// W₂: `[n, inputs]`. As an explicit expression of the parameters it can be differentiated again.
+pub fn geometry_network_with_slope(
+    tape: &mut Tape,
+    hidden: NormedLayer,
+    heads: NormedLayer,
+    x: Var,
+) -> (Var, Var) {
+    let w1 = weight_norm(tape, hidden.v, hidden.g);
+    let z = hidden.apply_weights(tape, w1, x);
+    let h = softplus_100(tape, z);
+    let w2 = weight_norm(tape, heads.v, heads.g);
+    let y = heads.apply_weights(tape, w2, h);
+
+    let slope = softplus_100_slope(tape, z);
+    let first_row = tape.gather_rows(w2, vec![0; x.rows]);
+    let d_z = tape.multiply(slope, first_row);
+    let w1_transposed = tape.transpose(w1);
+    (y, tape.matmul_transposed(d_z, w1_transposed))
 }
 
 /// Plain layers without bias, ReLU between them.

@@ -18,7 +18,8 @@ pub struct Proposal {
 impl Proposal {
     /// Log density at points `[n, 3]` of the region frame: `[n, 1]`.
     pub fn log_density(self, tape: &mut Tape, grid: &Grid, points: &[[f64; 3]]) -> Var {
-        let u = unit_cube(tape, points);
+        let x = tape.points(points);
+        let u = unit_cube(tape, x);
         let encoding = encode(tape, grid, self.table, u);
         plain_network(tape, &[self.hidden, self.out], encoding)
     }
@@ -33,10 +34,6 @@ pub fn weights(tape: &mut Tape, raw: Var, lengths: Vec<f64>, bins: usize) -> Var
 }
 
 /// (x + 1)/2: the cube [−1, 1]³ as the hash grids see it.
-pub fn unit_cube(tape: &mut Tape, points: &[[f64; 3]]) -> Var {
-    let u = points
-        .iter()
-        .flat_map(|x| x.map(|x| (x + 1.0) / 2.0))
-        .collect();
-    tape.constant(points.len(), 3, u)
+pub fn unit_cube(tape: &mut Tape, x: Var) -> Var {
+    tape.map(x, |x| (x + 1.0) / 2.0, |_, _| 0.5)
 }

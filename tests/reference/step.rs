@@ -1,7 +1,7 @@
-//! One training step of stage 1, whole: rays in; losses, images and the gradient of every parameter out.
+//! One training step, whole: rays in; losses, images and the gradient of every parameter out.
 
 use super::background::{Background, Field};
-use super::batch::{ActivationGradients, Images, Outcome, Step};
+use super::batch::{ActivationGradients, Images, Outcome, Stage, Step, Tangent};
 use super::losses;
 use super::networks::{NormedLayer, sigmoid};
 use super::proposal::{self, Proposal};
@@ -41,41 +41,174 @@ impl Spans {
     }
 }
 
+/// A proposal level's raw outputs and its weights, by which the interlevel loss reaches it.
+struct ProposalLevel {
+    raw: Var,
+    weights: Var,
+}
+
+/// The surface field at the bins' starts.
+struct Shading {
+    points: Vec<[f64; 3]>,
+    /// At every point that was asked: starts and taps.
+    sdf_all: Var,
+    sdf: Var,
+    logit: Var,
+    features: Var,
+    gradient: Var,
+}
+
+/// The loss that a stage has of its own, and what it asks the field for.
+struct StageLoss {
+    name: &'static str,
+    loss: Var,
+    bias_sdf: Option<Var>,
+    tangent_points: Option<Var>,
+    tangent_gradient: Option<Var>,
+}
+
 impl Step {
+    /// The step of stage 1.
     pub fn run(&self) -> Outcome {
+        self.run_stage(&Stage::Taps)
+    }
+
+    pub fn run_stage(&self, stage: &Stage) -> Outcome {
         let Step {
-            config,
-            rays,
-            draws,
-            now,
-            ..
+            config, rays, now, ..
         } = self;
         let (n, samples) = (rays.origins.len(), config.samples);
         let tape = &mut Tape::default();
         tape.relu_edge = self.relu_edge;
         let spans = self.put_parameters(tape);
-
-        // Rays and samples.
-        let stretches = rays.stretches.clone().unwrap_or_else(|| {
-            let along = rays.origins.iter().zip(&rays.directions);
-            along
-                .map(|(&origin, &direction)| sampling::collide(config.region, origin, direction))
-                .collect()
-        });
         let mut images = Images {
-            stretches,
+            stretches: self.stretches(),
             ..Images::default()
         };
-        let bins = [
-            config.proposal_samples[0],
-            config.proposal_samples[1],
-            samples,
+        let proposals = self.sample_rays(tape, &spans, &mut images);
+        let field = Surface {
+            table: spans.get("surface.table"),
+            hidden: spans.normed("surface.hidden"),
+            heads: spans.normed("surface.heads"),
+        };
+        let shading = self.shade(tape, field, stage, &mut images);
+        let gradient = shading.gradient;
+
+        // Density, weights, colours, image.
+        let inv_s = volume::inverse_scale(
+            tape,
+            shading.logit,
+            config.scale_range,
+            config.scale_floor,
+            now.inv_s_lower,
+        );
+        let beta = volume::reciprocal(tape, inv_s);
+        let sdf = self.empty_outside(tape, shading.sdf, &images.stretches);
+        let directions = self.sample_directions();
+        let distance = match stage {
+            Stage::Taps => sdf,
+            Stage::Analytic(_) => {
+                let directions = tape.points(&directions);
+                volume::distance_along_ray(tape, sdf, gradient, directions)
+            }
+        };
+        let density = volume::laplace_density(tape, distance, beta);
+        let density = tape.reshape(density, n, samples);
+        let lengths = per_ray(&images.distances[2], n, sampling::lengths);
+        let weights = volume::ray_weights(tape, density, lengths);
+        let rgb = self.sample_colors(tape, &spans, &shading, &directions);
+        let padded = volume::pad_color(tape, rgb);
+        let background = self.background(tape, &spans, &images.stretches);
+        let image = volume::composite(tape, weights, padded, background);
+        self.integrate(tape.value(weights), tape.value(gradient), &mut images);
+
+        // Losses.
+        let color_error = losses::color(tape, image, &rays.target);
+        let color = tape.sum(color_error);
+        let color = tape.scale(color, now.inv_count);
+        let eikonal = losses::eikonal(tape, gradient);
+        let eikonal = tape.scale(eikonal, config.eikonal_weight);
+        let own = match stage {
+            Stage::Taps => self.bias_loss(tape, field, sdf, &mut images),
+            Stage::Analytic(tangent) => {
+                self.tangent_loss(tape, field, gradient, tangent, &mut images)
+            }
+        };
+        let interlevel = self.interlevel_loss(tape, &proposals, &images);
+        let named = [
+            ("color", color),
+            ("eikonal", eikonal),
+            (own.name, own.loss),
+            ("interlevel", interlevel),
         ];
-        let mut proposal_raw = Vec::new();
-        let mut proposal_weights = Vec::new();
+        let total = named[1..]
+            .iter()
+            .fold(color, |sum, &(_, loss)| tape.add(sum, loss));
+        let mut losses: BTreeMap<String, f64> = named
+            .iter()
+            .map(|&(name, loss)| (name.to_string(), tape.scalar(loss)))
+            .collect();
+        losses.insert("total".into(), tape.scalar(total));
+
+        // Back again.
+        let gradients = tape.backward(total);
+        images.sdf = tape.value(shading.sdf_all).to_vec();
+        images.logit = tape.value(shading.logit).to_vec();
+        images.inv_s = tape.value(inv_s).to_vec();
+        images.density = tape.value(density).to_vec();
+        images.gradient = tape.value(gradient).to_vec();
+        images.features = tape.value(shading.features).to_vec();
+        images.rgb = tape.value(rgb).to_vec();
+        images.background = tape.value(background).to_vec();
+        images.color = tape.value(image).to_vec();
+        images.color_error = tape.value(color_error).to_vec();
+        let of_one = |var: Option<Var>| var.map_or(Vec::new(), |var| gradients.get(var));
+        let d_images = ActivationGradients {
+            proposal_raw: [0, 1].map(|level: usize| gradients.get(proposals[level].raw)),
+            sdf: gradients.get(shading.sdf_all),
+            logit: gradients.get(shading.logit),
+            gradient: gradients.get(gradient),
+            features: gradients.get(shading.features),
+            rgb: gradients.get(rgb),
+            background: gradients.get(background),
+            bias_sdf: of_one(own.bias_sdf),
+            tangent_points: of_one(own.tangent_points),
+            tangent_gradient: of_one(own.tangent_gradient),
+        };
+        Outcome {
+            losses,
+            images,
+            d_images,
+            gradients: spans.gradients(&gradients),
+        }
+    }
+
+    fn stretches(&self) -> Vec<Stretch> {
+        let rays = &self.rays;
+        rays.stretches.clone().unwrap_or_else(|| {
+            let along = rays.origins.iter().zip(&rays.directions);
+            along
+                .map(|(&origin, &direction)| {
+                    sampling::collide(self.config.region, origin, direction)
+                })
+                .collect()
+        })
+    }
+
+    /// Edges of all three levels; the proposal networks at the middles of the first two levels' bins.
+    fn sample_rays(
+        &self,
+        tape: &mut Tape,
+        spans: &Spans,
+        images: &mut Images,
+    ) -> Vec<ProposalLevel> {
+        let (config, n) = (&self.config, self.rays.origins.len());
+        let [first, second] = config.proposal_samples;
+        let bins = [first, second, config.samples];
+        let mut proposals = Vec::new();
         for level in 0..3 {
             for ray in 0..n {
-                let draw = config.train.then(|| draws.jitter[level][ray]);
+                let draw = config.train.then(|| self.draws.jitter[level][ray]);
                 let edges = if let Some(edges) = &self.edges {
                     edges[level][ray * (bins[level] + 1)..][..bins[level] + 1].to_vec()
                 } else if level == 0 {
@@ -88,7 +221,7 @@ impl Step {
                     let before = bins[level - 1];
                     let edges = &images.edges[level - 1][ray * (before + 1)..][..before + 1];
                     let weights = &images.proposal_weights[level - 1][ray * before..][..before];
-                    sampling::resample(edges, weights, now.anneal, bins[level], draw)
+                    sampling::resample(edges, weights, self.now.anneal, bins[level], draw)
                 };
                 images.distances[level].extend(sampling::distances(&edges, images.stretches[ray]));
                 images.edges[level].extend(edges);
@@ -106,79 +239,95 @@ impl Step {
                 let weights = proposal::weights(tape, raw, lengths, bins[level]);
                 images.proposal_raw[level] = tape.value(raw).to_vec();
                 images.proposal_weights[level] = tape.value(weights).to_vec();
-                proposal_raw.push(raw);
-                proposal_weights.push(weights);
+                proposals.push(ProposalLevel { raw, weights });
             }
         }
+        proposals
+    }
 
-        // The surface field at bin starts and around them.
-        let starts = self.points_at(
-            samples,
+    /// The surface field at bin starts, and g there: from six taps around them, or analytically.
+    fn shade(
+        &self,
+        tape: &mut Tape,
+        field: Surface,
+        stage: &Stage,
+        images: &mut Images,
+    ) -> Shading {
+        let (config, n) = (&self.config, self.rays.origins.len());
+        let count = n * config.samples;
+        let points = self.points_at(
+            config.samples,
             &per_ray(&images.distances[2], n, |t| t[..t.len() - 1].to_vec()),
         );
-        let steps: Vec<f64> = draws
-            .taps
-            .iter()
-            .map(|&draw| surface::tap_step(draw, config.tap_range, config.tap_floor))
-            .collect();
-        assert_eq!(steps.len(), n * samples, "one tap draw per shading sample");
-        images.points = self
-            .points
-            .clone()
-            .unwrap_or_else(|| [starts.clone(), surface::tap_points(&starts, &steps)].concat());
-        let field = Surface {
-            table: spans.get("surface.table"),
-            hidden: spans.normed("surface.hidden"),
-            heads: spans.normed("surface.heads"),
+        let (heads, sdf_all, gradient) = match stage {
+            Stage::Taps => {
+                let step = |&draw| surface::tap_step(draw, config.tap_range, config.tap_floor);
+                let steps: Vec<f64> = self.draws.taps.iter().map(step).collect();
+                assert_eq!(steps.len(), count, "one tap draw per shading sample");
+                let own = || [points.clone(), surface::tap_points(&points, &steps)].concat();
+                images.points = self.points.clone().unwrap_or_else(own);
+                let heads = field.heads(tape, &config.grid, &images.points);
+                let sdf_all = tape.columns(heads, 0..1);
+                let taps = tape.rows(sdf_all, count..7 * count);
+                let gradient = surface::six_tap_gradient(tape, taps, steps);
+                (heads, sdf_all, gradient)
+            }
+            Stage::Analytic(_) => {
+                let given = self.points.as_deref().map(|given| &given[..count]);
+                images.points = given.unwrap_or(&points).to_vec();
+                let x = tape.points(&images.points);
+                let (heads, gradient) = field.heads_and_gradient(tape, &config.grid, x);
+                (heads, tape.columns(heads, 0..1), gradient)
+            }
         };
-        let heads = field.heads(tape, &config.grid, &images.points);
-        let sdf_all = tape.columns(heads, 0..1);
-        let at_starts = tape.rows(heads, 0..n * samples);
-        let logit = tape.columns(at_starts, 1..2);
-        let features = tape.columns(at_starts, 2..2 + config.features);
-        let taps = tape.rows(sdf_all, n * samples..7 * n * samples);
-        let gradient = surface::six_tap_gradient(tape, taps, steps);
+        let at_starts = tape.rows(heads, 0..count);
+        Shading {
+            points,
+            sdf_all,
+            sdf: tape.rows(sdf_all, 0..count),
+            logit: tape.columns(at_starts, 1..2),
+            features: tape.columns(at_starts, 2..2 + config.features),
+            gradient,
+        }
+    }
 
-        // Density, weights, colours, image.
-        let inv_s = volume::inverse_scale(
-            tape,
-            logit,
-            config.scale_range,
-            config.scale_floor,
-            now.inv_s_lower,
-        );
-        let beta = volume::reciprocal(tape, inv_s);
-        let sdf = tape.rows(sdf_all, 0..n * samples);
-        let sdf = self.empty_outside(tape, sdf, &images.stretches);
-        let density = volume::laplace_density(tape, sdf, beta);
-        let density = tape.reshape(density, n, samples);
-        let lengths = per_ray(&images.distances[2], n, sampling::lengths);
-        let weights = volume::ray_weights(tape, density, lengths);
-        let rgb = self.sample_colors(tape, &spans, &starts, gradient, features);
-        let padded = volume::pad_color(tape, rgb);
-        let background = self.background(tape, &spans, &images.stretches);
-        let image = volume::composite(tape, weights, padded, background);
+    /// What is added up along a ray besides colour; `weights` `[N, S + 1]` with what is left behind the last sample.
+    fn integrate(&self, weights: &[f64], gradient: &[f64], images: &mut Images) {
+        let (n, samples) = (self.rays.origins.len(), self.config.samples);
+        let midpoints = per_ray(&images.distances[2], n, sampling::midpoints);
+        for ray in 0..n {
+            let range = ray * samples..(ray + 1) * samples;
+            let row = &weights[ray * (samples + 1)..][..samples + 1];
+            let (weights, behind) = (&row[..samples], row[samples]);
+            images.weights.extend(weights);
+            images.accumulation.push(weights.iter().sum());
+            images.transmittance.push(behind);
+            images
+                .depth
+                .push(volume::expected_depth(weights, &midpoints[range.clone()]));
+            images.normal.extend(mean_normal(
+                weights,
+                &gradient[range.start * 3..range.end * 3],
+            ));
+        }
+    }
 
-        // Losses.
-        let color_error = losses::color(tape, image, &rays.target);
-        let color = tape.sum(color_error);
-        let color = tape.scale(color, now.inv_count);
-        let eikonal = losses::eikonal(tape, gradient);
-        let eikonal = tape.scale(eikonal, config.eikonal_weight);
-
-        let weights_and_rest = tape.value(weights).to_vec();
-        images.weights = weights_and_rest
-            .chunks_exact(samples + 1)
-            .flat_map(|row| row[..samples].to_vec())
-            .collect();
+    /// `sdf`: with the rays outside emptied.
+    fn bias_loss(
+        &self,
+        tape: &mut Tape,
+        field: Surface,
+        sdf: Var,
+        images: &mut Images,
+    ) -> StageLoss {
+        let (config, rays) = (&self.config, &self.rays);
+        let (n, samples) = (rays.origins.len(), config.samples);
         let midpoints = per_ray(&images.distances[2], n, sampling::midpoints);
         let mut middles = Vec::new();
         for ray in 0..n {
             let range = ray * samples..(ray + 1) * samples;
-            let (weights, sdf) = (
-                &images.weights[range.clone()],
-                &tape.value(sdf)[range.clone()],
-            );
+            let weights = &images.weights[range.clone()];
+            let sdf = &tape.value(sdf)[range.clone()];
             let meets = !images.stretches[ray].outside;
             images.bias_gate.push(if meets {
                 losses::bias_gate(sdf, weights, config.bias_needs_opaque)
@@ -191,17 +340,6 @@ impl Step {
                 rays.directions[ray],
                 middle,
             ));
-            images.accumulation.push(weights.iter().sum());
-            images
-                .transmittance
-                .push(weights_and_rest[ray * (samples + 1) + samples]);
-            images
-                .depth
-                .push(volume::expected_depth(weights, &midpoints[range.clone()]));
-            images.normal.extend(mean_normal(
-                weights,
-                &tape.value(gradient)[range.start * 3..range.end * 3],
-            ));
         }
         images.bias_points = losses::bias_points(
             &middles,
@@ -210,76 +348,79 @@ impl Step {
             config.bias_offset,
         );
         let bias_sdf = field.sdf(tape, &config.grid, &images.bias_points);
-        let gates = images.bias_gate.clone();
-        let bias = losses::bias(
+        images.bias_sdf = tape.value(bias_sdf).to_vec();
+        let loss = losses::bias(
             tape,
             bias_sdf,
-            gates,
+            images.bias_gate.clone(),
             config.bias_epsilon,
             config.bias_reduction,
         );
-        let bias = tape.scale(bias, now.bias_weight);
+        StageLoss {
+            name: "bias",
+            loss: tape.scale(loss, self.now.bias_weight),
+            bias_sdf: Some(bias_sdf),
+            tangent_points: None,
+            tangent_gradient: None,
+        }
+    }
 
-        let mut interlevel = tape.constant(1, 1, vec![0.0]);
-        for (level, &weights) in proposal_weights.iter().enumerate() {
+    /// Over all samples, those of rays outside included. The shifts start at the bins' middles, though the normals are those of the
+    /// starts; the shifted points, and g there, keep their derivatives by those normals.
+    fn tangent_loss(
+        &self,
+        tape: &mut Tape,
+        field: Surface,
+        gradient: Var,
+        tangent: &Tangent,
+        images: &mut Images,
+    ) -> StageLoss {
+        let (n, samples) = (self.rays.origins.len(), self.config.samples);
+        let count = n * samples;
+        assert_eq!(tangent.draws.len(), count, "one draw per shading sample");
+        let midpoints = per_ray(&images.distances[2], n, sampling::midpoints);
+        let middles = self.points_at(samples, &midpoints);
+        let directions = tangent.draws.iter().map(|&u| surface::normalized(u));
+        let normals = surface::normals(tape, gradient);
+        let mut points =
+            surface::tangent_points(tape, &middles, normals, directions.collect(), tangent.step);
+        if let Some(given) = &self.points {
+            points = tape.moved(points, given[count..].as_flattened().to_vec());
+        }
+        images
+            .points
+            .extend((0..count).map(|sample| tape.point(points, sample)));
+        let (_, shifted) = field.heads_and_gradient(tape, &self.config.grid, points);
+        images.tangent_gradient = tape.value(shifted).to_vec();
+        let shifted_normals = surface::normals(tape, shifted);
+        let loss = losses::tangent(tape, normals, shifted_normals);
+        StageLoss {
+            name: "tangent",
+            loss: tape.scale(loss, tangent.weight),
+            bias_sdf: None,
+            tangent_points: Some(points),
+            tangent_gradient: Some(shifted),
+        }
+    }
+
+    fn interlevel_loss(
+        &self,
+        tape: &mut Tape,
+        proposals: &[ProposalLevel],
+        images: &Images,
+    ) -> Var {
+        let mut sum = tape.constant(1, 1, vec![0.0]);
+        for (level, proposal) in proposals.iter().enumerate() {
             let loss = losses::interlevel(
                 tape,
-                weights,
+                proposal.weights,
                 &images.edges[level],
                 &images.weights,
                 &images.edges[2],
             );
-            interlevel = tape.add(interlevel, loss);
+            sum = tape.add(sum, loss);
         }
-        let interlevel = tape.scale(interlevel, config.interlevel_weight);
-
-        let named = [
-            ("color", color),
-            ("eikonal", eikonal),
-            ("bias", bias),
-            ("interlevel", interlevel),
-        ];
-        let total = named[1..]
-            .iter()
-            .fold(color, |sum, &(_, loss)| tape.add(sum, loss));
-        let mut losses: BTreeMap<String, f64> = named
-            .iter()
-            .map(|&(name, loss)| (name.to_string(), tape.scalar(loss)))
-            .collect();
-        losses.insert("total".into(), tape.scalar(total));
-
-        // Back again.
-        let gradients = tape.backward(total);
-        images.sdf = tape.value(sdf_all).to_vec();
-        images.logit = tape.value(logit).to_vec();
-        images.inv_s = tape.value(inv_s).to_vec();
-        images.density = tape.value(density).to_vec();
-        images.gradient = tape.value(gradient).to_vec();
-        images.features = tape.value(features).to_vec();
-        images.rgb = tape.value(rgb).to_vec();
-        images.background = tape.value(background).to_vec();
-        images.color = tape.value(image).to_vec();
-        images.color_error = tape.value(color_error).to_vec();
-        images.bias_sdf = tape.value(bias_sdf).to_vec();
-        let d_images = ActivationGradients {
-            proposal_raw: [
-                gradients.get(proposal_raw[0]),
-                gradients.get(proposal_raw[1]),
-            ],
-            sdf: gradients.get(sdf_all),
-            logit: gradients.get(logit),
-            gradient: gradients.get(gradient),
-            features: gradients.get(features),
-            rgb: gradients.get(rgb),
-            background: gradients.get(background),
-            bias_sdf: gradients.get(bias_sdf),
-        };
-        Outcome {
-            losses,
-            images,
-            d_images,
-            gradients: spans.gradients(&gradients),
-        }
+        tape.scale(sum, self.config.interlevel_weight)
     }
 
     fn put_parameters(&self, tape: &mut Tape) -> Spans {
@@ -305,6 +446,14 @@ impl Step {
             )
         };
         distances.iter().enumerate().map(point).collect()
+    }
+
+    /// The direction of each sample's ray.
+    fn sample_directions(&self) -> Vec<[f64; 3]> {
+        let directions = self.rays.directions.iter();
+        directions
+            .flat_map(|&d| std::iter::repeat_n(d, self.config.samples))
+            .collect()
     }
 
     /// f := +1000 on rays that miss the region, where a background takes their place: no density, and no gradient through it.
@@ -353,30 +502,23 @@ impl Step {
         &self,
         tape: &mut Tape,
         spans: &Spans,
-        points: &[[f64; 3]],
-        gradient: Var,
-        features: Var,
+        shading: &Shading,
+        directions: &[[f64; 3]],
     ) -> Var {
         let config = &self.config;
-        let ray_of_sample: Vec<usize> = (0..points.len())
-            .map(|sample| sample / config.samples)
-            .collect();
-        let directions: Vec<[f64; 3]> = ray_of_sample
-            .iter()
-            .map(|&ray| self.rays.directions[ray])
-            .collect();
+        let rays = (0..directions.len()).map(|sample| sample / config.samples);
         let codes = self.codes(tape, spans, "appearance", config.appearance);
-        let codes = codes.map(|codes| tape.gather_rows(codes, ray_of_sample));
+        let codes = codes.map(|codes| tape.gather_rows(codes, rays.collect()));
         let layers: Vec<NormedLayer> = (0..=config.color_layers)
             .map(|layer| spans.normed(&format!("color.{layer}")))
             .collect();
         surface::color(
             tape,
             &layers,
-            points,
-            &directions,
-            gradient,
-            features,
+            &shading.points,
+            directions,
+            shading.gradient,
+            shading.features,
             codes,
         )
     }
@@ -433,8 +575,8 @@ fn per_ray(edges: &[f64], rays: usize, f: impl Fn(&[f64]) -> Vec<f64>) -> Vec<f6
 fn mean_normal(weights: &[f64], gradients: &[f64]) -> [f64; 3] {
     let mut normal = [0.0; 3];
     for (weight, g) in weights.iter().zip(gradients.chunks_exact(3)) {
-        let length = g.iter().map(|g| g * g).sum::<f64>().sqrt().max(1e-12);
-        (0..3).for_each(|axis| normal[axis] += weight * g[axis] / length);
+        let n = surface::normalized([g[0], g[1], g[2]]);
+        (0..3).for_each(|axis| normal[axis] += weight * n[axis]);
     }
     normal
 }

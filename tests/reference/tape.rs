@@ -124,6 +124,17 @@ impl Tape {
         &self.nodes[var.node].value
     }
 
+    /// Points as a constant `[n, 3]`.
+    pub fn points(&mut self, points: &[[f64; 3]]) -> Var {
+        self.constant(points.len(), 3, points.as_flattened().to_vec())
+    }
+
+    /// Row `row` of a matrix `[n, 3]`.
+    pub fn point(&self, x: Var, row: usize) -> [f64; 3] {
+        assert_eq!(x.cols, 3);
+        std::array::from_fn(|axis| self.value(x)[row * 3 + axis])
+    }
+
     /// The value of a 1 x 1 matrix.
     pub fn scalar(&self, var: Var) -> f64 {
         assert_eq!((var.rows, var.cols), (1, 1));
@@ -161,6 +172,16 @@ impl Tape {
     pub fn detach(&mut self, x: Var) -> Var {
         let value = self.value(x).to_vec();
         self.constant(x.rows, x.cols, value)
+    }
+
+    /// x with `value` in place of its own: all that depends on it is taken there, and its gradient is x's.
+    pub fn moved(&mut self, x: Var, value: Vec<f64>) -> Var {
+        assert_eq!(value.len(), x.len());
+        self.record(x.rows, x.cols, value, &[x], move |_, d_y, gradients| {
+            if let Some(d_x) = gradients.of(x) {
+                d_x.iter_mut().zip(d_y).for_each(|(d_x, d_y)| *d_x += d_y);
+            }
+        })
     }
 
     /// y = f(x) element by element; `derivative` is given x and y.
@@ -280,6 +301,22 @@ impl Tape {
         )
     }
 
+    /// xᵀ
+    pub fn transpose(&mut self, x: Var) -> Var {
+        let (rows, cols) = (x.rows, x.cols);
+        let mut value = vec![0.0; x.len()];
+        for (i, &x) in self.value(x).iter().enumerate() {
+            value[i % cols * rows + i / cols] = x;
+        }
+        self.record(cols, rows, value, &[x], move |_, d_y, gradients| {
+            if let Some(d_x) = gradients.of(x) {
+                for (i, d_x) in d_x.iter_mut().enumerate() {
+                    *d_x += d_y[i % cols * rows + i / cols];
+                }
+            }
+        })
+    }
+
     /// x + b in every row, for b `[1, cols]`.
     pub fn add_row(&mut self, x: Var, b: Var) -> Var {
         assert_eq!((1, x.cols), (b.rows, b.cols));
@@ -379,11 +416,9 @@ impl Tape {
     /// The same values as a matrix of another shape.
     pub fn reshape(&mut self, x: Var, rows: usize, cols: usize) -> Var {
         let value = self.value(x).to_vec();
-        self.record(rows, cols, value, &[x], move |_, d_y, gradients| {
-            if let Some(d_x) = gradients.of(x) {
-                d_x.iter_mut().zip(d_y).for_each(|(d_x, d_y)| *d_x += d_y);
-            }
-        })
+        let y = self.moved(x, value);
+        assert_eq!(y.len(), rows * cols);
+        Var { rows, cols, ..y }
     }
 
     /// Sum over all elements, 1 x 1.

@@ -1,7 +1,7 @@
 //! Small steps to test with: a configuration, parameters near the geometric initialisation, and rays, all drawn from a seed.
 
 use super::background::{Background, FieldConfig};
-use super::batch::{Draws, Now, Rays, Step, StepConfig};
+use super::batch::{Draws, Now, Rays, Stage, Step, StepConfig, Tangent};
 use super::hash_grid::Grid;
 use super::losses::BiasReduction;
 use super::sampling::Region;
@@ -204,4 +204,17 @@ pub fn step(config: StepConfig, n: usize, seed: u64) -> Step {
         points: None,
         relu_edge: ReluEdge::default(),
     }
+}
+
+/// Stage 2 with draws for `step`.
+pub fn second_stage(step: &Step, seed: u64) -> Stage {
+    let random = &mut Random(seed);
+    let samples = step.rays.origins.len() * step.config.samples;
+    Stage::Analytic(Tangent {
+        weight: 0.005,
+        step: 0.01,
+        draws: (0..samples)
+            .map(|_| std::array::from_fn(|_| random.normal()))
+            .collect(),
+    })
 }
