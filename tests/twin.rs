@@ -26,7 +26,8 @@ fn objective(outcome: &Outcome, span: &str) -> f64 {
 /// Compares sampled gradients of every span with central differences of step 1e-6, at fixed sample positions (no gradient flows
 /// through those). The seeds are such that no sampled difference straddles a kink (ReLU, |C − target|, the hinges, the heaviest sample).
 fn check_gradients(mut step: Step, stage: &Stage, seed: u64) {
-    let outcome = step.run_stage(stage);
+    step.stage = stage.clone();
+    let outcome = step.run();
     step.edges = Some(outcome.images.edges.clone());
     for (name, loss) in &outcome.losses {
         assert!(*loss > 0.0, "the {name} loss is {loss}: nothing is tested");
@@ -53,7 +54,7 @@ fn check_gradients(mut step: Step, stage: &Stage, seed: u64) {
             let value = step.params[&span][i];
             let mut at = |value: f64| {
                 step.params.get_mut(&span).expect("a span")[i] = value;
-                objective(&step.run_stage(stage), &span)
+                objective(&step.run(), &span)
             };
             let difference = (at(value + 1e-6) - at(value - 1e-6)) / 2e-6;
             at(value);
@@ -227,16 +228,17 @@ fn given_points_are_taken_as_they_are() {
     let mut step = trial::step(trial::config(), 6, 20);
     let second = trial::second_stage(&step, 21);
     for stage in [Stage::Taps, second] {
+        step.stage = stage;
         step.points = None;
-        let own = step.run_stage(&stage);
+        let own = step.run();
         step.points = Some(own.images.points.clone());
-        let given = step.run_stage(&stage);
+        let given = step.run();
         assert_eq!(given.losses, own.losses);
         assert_eq!(given.gradients, own.gradients);
         // The last points are the last ray's outermost taps, or its last shifted point.
         let last = step.points.as_mut().and_then(|points| points.last_mut());
         last.expect("points")[0] += 0.05;
-        assert_ne!(step.run_stage(&stage).losses, own.losses);
+        assert_ne!(step.run().losses, own.losses);
     }
 }
 

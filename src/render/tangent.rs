@@ -10,11 +10,11 @@ use crate::model::{FieldBuffers, Model, Scratch, Surface};
 
 /// Buffers and kernels of the tangent-normal loss of a batch of samples.
 pub struct Tangent {
-    pub loss: Buffer<f32>, // [n]
-    points: Buffer<f32>,   // [3, n] beside the samples
-    d_points: Buffer<f32>, // [3, n]
-    sdf: Buffer<f32>,      // [n] there; nobody asks for it, so `d_sdf` stays zero
-    d_sdf: Buffer<f32>,    // [n]
+    pub loss: Buffer<f32>,   // [n]
+    pub points: Buffer<f32>, // [3, n] beside the samples
+    d_points: Buffer<f32>,   // [3, n]
+    sdf: Buffer<f32>,        // [n] there; nobody asks for it, so `d_sdf` stays zero
+    d_sdf: Buffer<f32>,      // [n]
     field: FieldBuffers,
     place: Kernel<tangent_points::Args>,
     compare: Kernel<tangent_loss::Args>,

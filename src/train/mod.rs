@@ -315,6 +315,9 @@ impl Trainer {
     pub fn renderer(&self) -> &Renderer {
         &self.renderer
     }
+    pub fn loss(&self) -> &Loss {
+        &self.loss
+    }
     pub fn region(&self) -> &Region {
         &self.region
     }

@@ -22,8 +22,9 @@ fn whole_step_of_stage_2() {
 
 /// A whole stage on a small batch: samples, fields, image, losses, and the gradient of every parameter.
 fn check_whole_step(npz: &Npz, stage: &Stage, own_loss: (&str, &str)) {
-    let step = golden::whole_step(npz);
-    let outcome = step.run_stage(stage);
+    let mut step = golden::whole_step(npz);
+    step.stage = stage.clone();
+    let outcome = step.run();
     let images = &outcome.images;
     let samples = step.config.samples;
 

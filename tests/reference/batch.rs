@@ -114,6 +114,7 @@ pub struct Step {
     pub edges: Option<[Vec<f64>; 3]>,
     /// The surface's points, `[7 · N · S]` or in stage 2 `[2 · N · S]`, likewise: rounded to float32, a point moves by a ten-thousandth of a fine cell.
     pub points: Option<Vec<[f64; 3]>>,
+    pub stage: Stage,
     pub relu_edge: ReluEdge,
 }
 

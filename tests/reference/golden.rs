@@ -156,6 +156,7 @@ pub fn whole_step(npz: &Npz) -> Step {
         now,
         edges: None,
         points: None,
+        stage: Stage::Taps,
         relu_edge: ReluEdge::default(),
     }
 }

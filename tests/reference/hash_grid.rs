@@ -17,6 +17,8 @@ pub struct Level {
     pub offset: usize,
     /// True where every vertex has an entry of its own.
     pub dense: bool,
+    /// Cells are chosen in float32, as the kernels choose them: on a border both neighbours give the same value, but not the same slope.
+    pub float32_cells: bool,
 }
 
 #[derive(Clone, Debug, PartialEq)]
@@ -46,6 +48,7 @@ impl Level {
             entries,
             offset,
             dense: vertices <= u64::from(entries),
+            float32_cells: false,
         }
     }
 
@@ -63,8 +66,15 @@ impl Level {
 
     pub fn cell(&self, u: [f64; 3]) -> Cell {
         let p = u.map(|u| self.scale * u + 0.5);
-        let first = p.map(|p| p.floor() as i64 as u32);
-        let w = p.map(|p| p - p.floor());
+        let low = match self.float32_cells {
+            true => u.map(|u| {
+                let (half, x) = (0.5 * self.scale as f32, (2.0 * u - 1.0) as f32);
+                f64::from((half.mul_add(x, half) + 0.5).floor())
+            }),
+            false => p.map(f64::floor),
+        };
+        let first = low.map(|low| low as i64 as u32);
+        let w = [0, 1, 2].map(|axis| p[axis] - low[axis]);
         let mut cell = Cell {
             index: [0; 8],
             weight: [0.0; 8],

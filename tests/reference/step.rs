@@ -68,14 +68,13 @@ struct StageLoss {
 }
 
 impl Step {
-    /// The step of stage 1.
     pub fn run(&self) -> Outcome {
-        self.run_stage(&Stage::Taps)
-    }
-
-    pub fn run_stage(&self, stage: &Stage) -> Outcome {
         let Step {
-            config, rays, now, ..
+            config,
+            rays,
+            now,
+            stage,
+            ..
         } = self;
         let (n, samples) = (rays.origins.len(), config.samples);
         let tape = &mut Tape::default();

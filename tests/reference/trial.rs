@@ -202,6 +202,7 @@ pub fn step(config: StepConfig, n: usize, seed: u64) -> Step {
         now,
         edges: None,
         points: None,
+        stage: Stage::Taps,
         relu_edge: ReluEdge::default(),
     }
 }

@@ -4,8 +4,9 @@
 //! precision there, and their background is a fixed colour, here the learned one at that colour.
 
 use crate::reference::background::Background;
-use crate::reference::batch::Step;
+use crate::reference::batch::{Stage, Step};
 use crate::reference::golden;
+use crate::reference::npz::Npz;
 use crate::reference::tape::ReluEdge;
 use crate::rig::{GradientRange, Rig, agreement};
 use neurodin::Result;
@@ -15,11 +16,27 @@ use neurodin::train::schedule::Schedule;
 
 #[test]
 fn published_step() -> Result<()> {
-    let Some(npz) = golden::open("e2e_stage1") else {
+    match golden::open("e2e_stage1") {
+        Some(npz) => check(&npz, Config::preset("outdoor-tiny")?, Stage::Taps),
+        None => Ok(()),
+    }
+}
+
+#[test]
+fn published_step_of_stage_2() -> Result<()> {
+    let Some(npz) = golden::open("e2e_stage2") else {
         return Ok(());
     };
-    let published = golden::whole_step(&npz);
-    let mut config = Config::preset("outdoor-tiny")?;
+    let second = Config::preset("outdoor-tiny")?.second_stage();
+    let config = Config {
+        first_step: 0,
+        ..second.expect("a preset with two stages")
+    };
+    check(&npz, config, golden::second_stage(&npz))
+}
+
+fn check(npz: &Npz, mut config: Config, stage: Stage) -> Result<()> {
+    let published = golden::whole_step(npz);
     config.rays = published.rays.origins.len() as u32;
     config.loss.bias.reduction = BiasReduction::Published;
     let rig = Rig::new(config, RegionShape::Sphere, false)?;
@@ -34,7 +51,7 @@ fn published_step() -> Result<()> {
     params.insert("background.constant".into(), logits);
     rig.upload_parameters(&mut params)?;
     let rays = rig.upload_rays(&published.rays)?;
-    let draws = rig.upload_draws(&published.draws)?;
+    let (draws, stage) = rig.upload_draws(&published.draws, &stage)?;
     let now = neurodin::train::schedule::Now {
         anneal: published.now.anneal,
         inv_s_lower: published.now.inv_s_lower,
@@ -55,6 +72,7 @@ fn published_step() -> Result<()> {
         now: published.now,
         edges: Some(rig.edges()?),
         points: Some(rig.points()?),
+        stage,
         relu_edge: ReluEdge::default(),
     };
     let twin = GradientRange::of(&twin);

@@ -1,19 +1,20 @@
 //! A trainer on the device beside the twin of its configuration, and the way of numbers between the two.
 
 use crate::reference::background::{Background, FieldConfig};
-use crate::reference::batch::{Draws, Rays, Step, StepConfig};
+use crate::reference::batch::{Draws, Rays, Stage, Step, StepConfig, Tangent};
 use crate::reference::hash_grid::{Grid, Level};
 use crate::reference::losses;
 use crate::reference::sampling::{self, Stretch};
 use crate::reference::tape::ReluEdge;
 use neurodin::Result;
-use neurodin::config::{BackgroundKind, BiasReduction, Config};
+use neurodin::config::{BackgroundKind, BiasReduction, Config, GradientKind};
 use neurodin::gpu::{Buffer, Gpu, GpuOptions};
 use neurodin::model::HashGrid;
 use neurodin::scene::synthetic::{CENTER, RADIUS, SyntheticOptions};
 use neurodin::scene::{Region, RegionShape, Scene, SceneOptions};
 use neurodin::train::Trainer;
 use std::collections::BTreeMap;
+use std::f64::consts::TAU;
 
 pub struct Rig {
     pub gpu: Gpu,
@@ -195,27 +196,51 @@ impl Rig {
         self.rays()
     }
 
-    /// The random numbers that lie in the device's buffer: pixels [3, n], jitter [3, n], taps [n, S], background [n, edges].
-    pub fn draws(&self) -> Result<Draws> {
+    /// The random numbers that lie in the device's buffer: pixels [3, n], jitter [3, n], taps [n, S] or the tangent loss's directions
+    /// [2, n, S], background [n, edges].
+    pub fn draws(&self) -> Result<(Draws, Stage)> {
         let all = self.download(&self.trainer.renderer().draws.all)?;
-        let (n, taps) = (self.n_rays(), self.n_rays() * self.twin.samples);
-        let jitter = |level: usize| all[(3 + level) * n..(4 + level) * n].to_vec();
-        Ok(Draws {
+        let (n, samples) = (self.n_rays(), self.n_rays() * self.twin.samples);
+        let (jitter, rest) = all[3 * n..].split_at(3 * n);
+        let jitter = |level: usize| jitter[level * n..(level + 1) * n].to_vec();
+        let blocks = match self.config.surface.gradient {
+            GradientKind::Taps => 1,
+            GradientKind::Analytic => 2,
+        };
+        let (of_samples, background) = rest.split_at(blocks * samples);
+        let stage = match self.config.surface.gradient {
+            GradientKind::Taps => Stage::Taps,
+            GradientKind::Analytic => Stage::Analytic(Tangent {
+                weight: self.config.loss.tangent,
+                step: 0.01,
+                draws: (0..samples)
+                    .map(|i| direction(of_samples[i], of_samples[samples + i]))
+                    .collect(),
+            }),
+        };
+        let draws = Draws {
             jitter: [jitter(0), jitter(1), jitter(2)],
-            taps: all[6 * n..6 * n + taps].to_vec(),
-            background: all[6 * n + taps..].to_vec(),
-        })
+            taps: of_samples[..samples].to_vec(),
+            background: background.to_vec(),
+        };
+        Ok((draws, stage))
     }
 
-    pub fn upload_draws(&self, draws: &Draws) -> Result<Draws> {
+    pub fn upload_draws(&self, draws: &Draws, stage: &Stage) -> Result<(Draws, Stage)> {
         let pixels = vec![0.5; 3 * self.n_rays()];
         let [first, second, third] = &draws.jitter;
+        let of_samples = match stage {
+            Stage::Taps => draws.taps.clone(),
+            Stage::Analytic(tangent) => {
+                planar(&tangent.draws.iter().map(uniforms).collect::<Vec<_>>())
+            }
+        };
         let all = [
             &pixels,
             first,
             second,
             third,
-            &draws.taps,
+            &of_samples,
             &draws.background,
         ];
         self.upload(
@@ -225,10 +250,14 @@ impl Rig {
         self.draws()
     }
 
-    /// The surface's points, samples and taps.
+    /// The surface's points: samples and taps, or samples and the tangent loss's points.
     pub fn points(&self) -> Result<Vec<[f64; 3]>> {
         let points = &self.trainer.renderer().surface.points;
-        Ok(interleaved(&self.download(points)?))
+        let mut points = interleaved(&self.download(points)?);
+        if let Some(tangent) = &self.trainer.loss().tangent {
+            points.extend(interleaved::<3>(&self.download(&tangent.points)?));
+        }
+        Ok(points)
     }
 
     /// Normalised edges of all three levels.
@@ -236,6 +265,23 @@ impl Rig {
         let of = |level: usize| self.download(self.trainer.renderer().sampler.edges_of(level));
         Ok([of(0)?, of(1)?, of(2)?])
     }
+}
+
+/// The unit vector that the device makes of two uniforms (glsl/lib/tangent.glsl).
+fn direction(z: f64, turn: f64) -> [f64; 3] {
+    let z = 2.0 * z - 1.0;
+    let radius = (1.0 - z * z).max(0.0).sqrt();
+    let (sine, cosine) = (TAU * turn).sin_cos();
+    [radius * cosine, radius * sine, z]
+}
+
+/// The uniforms that make a vector's direction.
+fn uniforms(v: &[f64; 3]) -> [f64; 2] {
+    let length = v.iter().map(|x| x * x).sum::<f64>().sqrt();
+    [
+        0.5 * (v[2] / length + 1.0),
+        v[1].atan2(v[0]).rem_euclid(TAU) / TAU,
+    ]
 }
 
 /// The twin's configuration for one of the crate's.
@@ -319,6 +365,7 @@ fn grid(shape: HashGrid) -> Grid {
         entries: level.entries,
         offset: level.offset as usize,
         dense: level.hashed == 0,
+        float32_cells: true,
     };
     Grid {
         levels: shape.level_table().iter().map(level).collect(),

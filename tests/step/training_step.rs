@@ -1,6 +1,6 @@
 //! `Trainer::step` in the middle of a run, in several configurations, against the twin given the same rays, draws and parameters.
 
-use crate::reference::batch::{Now, Outcome, Step};
+use crate::reference::batch::{Now, Outcome, Stage, Step};
 use crate::reference::optimizer::Adam;
 use crate::reference::sampling;
 use crate::reference::tape::ReluEdge;
@@ -31,6 +31,37 @@ fn preset(name: &str) -> Config {
 #[test]
 fn outdoors_with_one_background_color() -> Result<()> {
     check(preset("outdoor-tiny"), RegionShape::Sphere, 9, false)
+}
+
+/// The second stage of a preset.
+fn second(name: &str) -> Config {
+    let first = preset(name);
+    Config {
+        first_step: 0,
+        steps: first.steps,
+        rays: first.rays,
+        ..first.second_stage().expect("a preset with two stages")
+    }
+}
+
+#[test]
+fn second_stage_outdoors() -> Result<()> {
+    check(second("outdoor-tiny"), RegionShape::Sphere, 9, false)
+}
+
+#[test]
+fn second_stage_by_the_portable_kernels() -> Result<()> {
+    check(second("outdoor-tiny"), RegionShape::Sphere, 9, true)
+}
+
+#[test]
+fn second_stage_indoors_with_other_features() -> Result<()> {
+    let mut config = second("indoor-tiny");
+    config.hash.features = 4;
+    config.hash.log2_size = 14;
+    config.appearance.dims = 8;
+    let half = dvec3(1.0, 0.8, 0.9);
+    check(config, RegionShape::Box { half }, 9, false)
 }
 
 #[test]
@@ -115,10 +146,16 @@ fn check(config: Config, shape: RegionShape, seed: u64, portable: bool) -> Resul
 
     let rays = rig.rays()?;
     check_stretches(&rig, &rays);
+    let (draws, stage) = rig.draws()?;
+    let own_loss = match stage {
+        Stage::Taps => "bias",
+        Stage::Analytic(_) => "tangent",
+    };
     let mut step = Step {
         config: rig.twin.clone(),
         params: params.clone(),
-        draws: rig.draws()?,
+        draws,
+        stage,
         now: Now {
             anneal: now.anneal,
             inv_s_lower: now.inv_s_lower,
@@ -154,7 +191,7 @@ fn check(config: Config, shape: RegionShape, seed: u64, portable: bool) -> Resul
     step.points = Some(rig.points()?);
     let twin = step.run();
     check_images(&rig, &twin)?;
-    check_losses(&twin, &losses);
+    check_losses(&twin, &losses, own_loss);
     check_update(&rig, &GradientRange::of(&step), &params, [&m0, &v0], &now)?;
     rig.check_device()
 }
@@ -246,7 +283,7 @@ fn check_images(rig: &Rig, twin: &Outcome) -> Result<()> {
     Ok(())
 }
 
-fn check_losses(twin: &Outcome, device: &StepLosses) {
+fn check_losses(twin: &Outcome, device: &StepLosses, own_loss: &str) {
     assert_eq!(device.step, STEP);
     let device = |name: &str| -> f64 {
         let terms = TERMS
@@ -255,7 +292,7 @@ fn check_losses(twin: &Outcome, device: &StepLosses) {
             .filter(|(term, _)| term.starts_with(name));
         terms.map(|(_, &value)| f64::from(value)).sum()
     };
-    for name in ["color", "eikonal", "interlevel", "bias"] {
+    for name in ["color", "eikonal", "interlevel", own_loss] {
         let (device, twin) = (device(name), twin.losses[name]);
         println!("{name} loss {twin:.6}, device {device:.6}");
         assert!(twin > 0.0, "no {name} loss to test");
