@@ -408,9 +408,9 @@ impl GradientRange {
         GradientRange([with(0.0), with(1.0)])
     }
 
-    /// Relative L2 distance of at most 1e-4 and a cosine of at least 0.99999 to the nearest gradient in range.
+    /// Relative L2 distance of at most `tolerance` and a cosine of at least 0.99999 to the nearest gradient in range.
     #[track_caller]
-    pub fn check(&self, span: &str, device: &[f64]) {
+    pub fn check(&self, span: &str, device: &[f64], tolerance: f64) {
         let [a, b] = [&self.0[0][span], &self.0[1][span]];
         assert_eq!(device.len(), a.len(), "{span}");
         let range = a.iter().zip(b).zip(device);
@@ -423,7 +423,7 @@ impl GradientRange {
             1.0 - cosine
         );
         assert!(
-            distance <= 1e-4 && cosine >= 0.99999,
+            distance <= tolerance && cosine >= 0.99999,
             "{span}: relative L2 {distance:.2e}, cosine {cosine}"
         );
     }

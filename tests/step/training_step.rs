@@ -326,7 +326,7 @@ fn check_update(
             .zip(&m0[name])
             .map(|(m1, m0)| (m1 - beta * m0) / (1.0 - beta))
             .collect();
-        twin.check(name, &gradient);
+        twin.check(name, &gradient, 1e-4);
 
         let (rate, decay) = match span.group {
             Group::Fields => (now.lr_fields, optimizer.fields.weight_decay),
