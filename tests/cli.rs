@@ -412,7 +412,8 @@ fn a_run_from_photographs_to_mesh() {
     );
     assert_eq!(dry.code, Some(0), "{}", dry.stderr);
     let result: Value = serde_json::from_str(&dry.stdout).unwrap();
-    assert_eq!(result["config"]["steps"], 12);
+    assert_eq!(result["config"]["steps"], 6);
+    assert_eq!(result["config"]["stage2"]["steps"], 6);
     assert!(!root.join("run").exists());
 
     let whole = said(
@@ -434,7 +435,7 @@ fn a_run_from_photographs_to_mesh() {
         assert!(run_folder.join(file).is_file(), "{file}");
     }
     let steps = logged(&run_folder, "step");
-    assert!(steps.len() >= 5, "{steps:?}");
+    assert!(steps.len() >= 4, "{steps:?}");
     assert!(
         steps
             .iter()
@@ -452,7 +453,7 @@ fn a_run_from_photographs_to_mesh() {
     let longer = run(&["train", "--out", &out, "--resume", "--steps", "16"]);
     assert_eq!(longer.code, Some(0), "{}", longer.stderr);
     assert!(
-        longer.stderr.contains("steps: 12 -> 16"),
+        longer.stderr.contains("steps: 6 -> 10"),
         "{}",
         longer.stderr
     );
@@ -550,6 +551,8 @@ fn an_interrupted_run_is_saved_and_goes_on() {
             &out,
             "--preset",
             "outdoor-tiny",
+            "--stage",
+            "1",
             "--steps",
             "1000000",
         ],
@@ -591,4 +594,28 @@ fn an_interrupted_run_is_saved_and_goes_on() {
     assert_eq!(logged(&root.join("run"), "resumed")[0]["step"], step);
     let finished = logged(&root.join("run"), "finished").pop().unwrap();
     assert_eq!(finished["step"], step + 2);
+
+    // Its second stage, later; and not without the first.
+    let second = run(&[
+        "train",
+        "--out",
+        &out,
+        "--resume",
+        "--stage",
+        "2",
+        "--steps",
+        &(step + 5).to_string(),
+    ]);
+    assert_eq!(second.code, Some(0), "{}", second.stderr);
+    let finished = logged(&root.join("run"), "finished").pop().unwrap();
+    assert_eq!(finished["step"], step + 5);
+    let rendered = run(&["eval", &out, "--json"]);
+    assert_eq!(rendered.code, Some(0), "{}", rendered.stderr);
+    let fewer = (step + 3).to_string();
+    let shorter = ["train", "--out", &out, "--resume", "--steps", &fewer];
+    fails(&shorter, 3, &["steps", "next:"]);
+    let alone = path("alone");
+    let refused = ["train", &photos, "--out", &alone, "--stage", "2"];
+    fails(&refused, 3, &["first stage", "--resume"]);
+    assert!(!root.join("alone").exists());
 }

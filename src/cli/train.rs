@@ -244,7 +244,10 @@ fn resumed(args: &TrainArgs, out: &Path) -> Result<Resumed> {
     let mut was = latest.checkpoint.state().config.clone();
     if args.settings.stage == Some(2) && was.first_step == 0 && was.stage2.steps == 0 {
         // It was begun without a second stage: that is as long now as its preset has it.
-        was.stage2.steps = Config::preset(&was.preset)?.stage2.steps;
+        was.stage2.steps = match args.settings.steps {
+            Some(total) => total.saturating_sub(was.steps),
+            None => Config::preset(&was.preset)?.stage2.steps,
+        };
     }
     let config = args
         .settings
@@ -279,6 +282,16 @@ fn resume(args: &TrainArgs, out: &Path, context: &Context) -> anyhow::Result<Tas
                 "{}: what was learned does not fit these changed settings:\n  {}\n  next: resume without them, or begin a new run in another --out",
                 latest.checkpoint.path().display(),
                 refused.join("\n  ")
+            ),
+        }
+        .into());
+    }
+    let end = config.first_step + config.steps;
+    if state.step > end {
+        return Err(Error::Config {
+            what: format!(
+                "{} steps are done, and this stage would end with step {end}\n  next: more --steps, or none to keep what the run had",
+                state.step
             ),
         }
         .into());

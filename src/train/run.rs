@@ -28,7 +28,7 @@ const BLOCKS: usize = 3;
 const RATE_FACTOR: &str = "learning_rate_factor";
 
 impl Trainer {
-    /// Trains from where this stands to the end of the configuration's steps, writing previews and checkpoints into `run`.
+    /// Trains from where this stands to the end of the stage, writing previews and checkpoints into `run`.
     /// `tell` hears of everything that happens; once it answers [`Control::Stop`] a checkpoint is saved and the run ends.
     ///
     /// # Errors
@@ -139,10 +139,12 @@ impl Trainer {
         if saved.0 != self.step || checkpoint::files(&run.checkpoints())?.is_empty() {
             self.save(&run.checkpoints())?;
         }
-        tell(Event::Finished {
-            step: self.step,
-            seconds: began.elapsed().as_secs_f64(),
-        });
+        if end == steps {
+            tell(Event::Finished {
+                step: self.step,
+                seconds: began.elapsed().as_secs_f64(),
+            });
+        }
         Ok(())
     }
 

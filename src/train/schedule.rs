@@ -168,6 +168,35 @@ mod tests {
         }
     }
 
+    /// The second stage's bound B, and everything else from anew (METHOD 1.3, 1.4).
+    #[test]
+    fn published_table_of_stage_2() {
+        let first = Config::default();
+        let second = first.second_stage().expect("two stages");
+        assert_eq!(second.second_stage(), None, "there is no third");
+        let (first, second) = (Schedule::new(&first), Schedule::new(&second));
+        for (step, bound) in [
+            (0, 0.01),
+            (1_000, 0.198),
+            (5_000, 0.991),
+            (10_000, 2.08),
+            (20_000, 4.60),
+            (50_000, 16.04),
+            (100_000, 59.61),
+            (200_000, 500.0),
+            (250_000, 1443.9),
+            (300_000, 3000.0),
+        ] {
+            let (now, then) = (second.at(300_000 + step), first.at(step));
+            assert!((now.inv_s_lower / bound - 1.0).abs() < 3e-3, "{now:?}");
+            assert_eq!(now.bias_weight, 0.0);
+            assert_eq!(
+                (now.step, now.lr_fields, now.anneal),
+                (then.step, then.lr_fields, then.anneal)
+            );
+        }
+    }
+
     /// Warm-up and both sides of every milestone (METHOD 1.2).
     #[test]
     fn learning_rates() {
