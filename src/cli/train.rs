@@ -241,12 +241,17 @@ struct Resumed {
 fn resumed(args: &TrainArgs, out: &Path) -> Result<Resumed> {
     let run = RunDirectory::open(out)?;
     let latest = checkpoint::latest(&run.checkpoints())?;
-    let mut was = latest.checkpoint.state().config.clone();
-    if args.settings.stage == Some(2) && was.first_step == 0 && was.stage2.steps == 0 {
-        // It was begun without a second stage: that is as long now as its preset has it.
+    let state = latest.checkpoint.state();
+    let mut was = state.config.clone();
+    let second_asked = args.settings.stage == Some(2);
+    if state.step == was.steps && (was.stage2.steps > 0 || second_asked) {
+        // The first stage is done and keeps its length; one that was begun without a second now gets its preset's.
         was.stage2.steps = match args.settings.steps {
             Some(total) => total.saturating_sub(was.steps),
-            None => Config::preset(&was.preset)?.stage2.steps,
+            None if second_asked && was.stage2.steps == 0 => {
+                Config::preset(&was.preset)?.stage2.steps
+            }
+            None => was.stage2.steps,
         };
     }
     let config = args
