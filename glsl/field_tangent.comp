@@ -1,5 +1,6 @@
 #version 460
-// Directional derivative of a field's input along v = ∂loss/∂g, one point per invocation: ȧ = J v, which is ∂loss/∂a for g = Jᵀ a.
+// Directional derivative of a field's input along v = ∂loss/∂g: ȧ = J v, which is ∂loss/∂a for g = Jᵀ a. One (point, level) per
+// invocation; the level is the launch's slice.
 #include "lib/prelude.glsl"
 #include "lib/hash_grid.glsl"
 #include "lib/field.glsl"
@@ -18,19 +19,18 @@ void main() {
     if (point >= n) return;
     vec3 x = vec3(points.at[point], points.at[n + point], points.at[2u * n + point]);
     vec3 v = vec3(d_gradient.at[point], d_gradient.at[n + point], d_gradient.at[2u * n + point]);
-    if (COORDINATES != 0u) {
+    uint l = level_of_slice(LEVELS);
+    if (COORDINATES != 0u && l == 0u) {
         [[unroll]] for (uint c = 0u; c < 3u; ++c) tangents.at[c * n + point] = v[c];
     }
-    for (uint l = 0u; l < LEVELS; ++l) {
-        Level level = levels.at[l];
-        Cell cell = cell_of(level, x);
-        float tangent[FEATURES];
-        [[unroll]] for (uint f = 0u; f < FEATURES; ++f) tangent[f] = 0.0;
-        [[unroll]] for (uint corner = 0u; corner < 8u; ++corner) {
-            uint entry = corner_entry(level, cell, corner) * FEATURES;
-            float along = dot(corner_slope(level, cell, corner), v);
-            [[unroll]] for (uint f = 0u; f < FEATURES; ++f) tangent[f] = fma(along, table.at[entry + f], tangent[f]);
-        }
-        [[unroll]] for (uint f = 0u; f < FEATURES; ++f) tangents.at[(COORDINATES + l * FEATURES + f) * n + point] = tangent[f];
+    Level level = levels.at[l];
+    Cell cell = cell_of(level, x);
+    float tangent[FEATURES];
+    [[unroll]] for (uint f = 0u; f < FEATURES; ++f) tangent[f] = 0.0;
+    [[unroll]] for (uint corner = 0u; corner < 8u; ++corner) {
+        uint entry = corner_entry(level, cell, corner) * FEATURES;
+        float along = dot(corner_slope(level, cell, corner), v);
+        [[unroll]] for (uint f = 0u; f < FEATURES; ++f) tangent[f] = fma(along, table.at[entry + f], tangent[f]);
     }
+    [[unroll]] for (uint f = 0u; f < FEATURES; ++f) tangents.at[(COORDINATES + l * FEATURES + f) * n + point] = tangent[f];
 }

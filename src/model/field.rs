@@ -398,10 +398,13 @@ impl Field {
                 tangents: scratch.tangents.ptr_mut(),
                 n,
             };
-            let work = items.flops(4.0 * self.interpolation_flops());
+            let levels = f64::from(self.shape.grid.levels);
+            let by_level = items
+                .slices(self.shape.grid.levels)
+                .flops(4.0 * self.interpolation_flops() / levels);
             rec.run(
                 &self.kernels().tangent,
-                work.bytes(self.gather_bytes() + rows),
+                by_level.bytes((self.gather_bytes() + rows) / levels),
                 args,
             );
         }
