@@ -34,16 +34,20 @@ fn scene(folder: &Path) -> Scene {
     Scene::open(folder, &SceneOptions::default()).unwrap()
 }
 
+fn sphere(radius: f64) -> Region {
+    Region {
+        center: DVec3::ZERO,
+        radius,
+        shape: RegionShape::Sphere,
+        how: "stated".into(),
+    }
+}
+
 #[test]
 fn a_restored_run_takes_the_same_next_step() {
     let folder = tempfile::tempdir().unwrap();
     let scene = scene(folder.path());
-    let region = Region {
-        center: DVec3::ZERO,
-        radius: 1.1,
-        shape: RegionShape::Sphere,
-        how: "stated".into(),
-    };
+    let region = sphere(1.1);
     // Every kind of parameter there is: codes, a background field, both proposals.
     let config = Config::preset("outdoor-tiny")
         .and_then(|config| {
@@ -95,12 +99,7 @@ fn a_restored_run_takes_the_same_next_step() {
 fn losses_that_are_not_finite_lead_back_to_the_last_checkpoint() {
     let folder = tempfile::tempdir().unwrap();
     let scene = scene(folder.path());
-    let region = Region {
-        center: DVec3::ZERO,
-        radius: 1.1,
-        shape: RegionShape::Sphere,
-        how: "stated".into(),
-    };
+    let region = sphere(1.1);
     let settings = "steps = 30\nrays = 16\nhash.levels = 4\nhash.log2_size = 10\nreport.preview_steps = 0\nreport.checkpoint_steps = 5";
     let config = Config::preset("outdoor-tiny")
         .and_then(|config| config.with_toml(settings, "test"))
@@ -174,20 +173,14 @@ fn a_checkpoint_of_another_region_or_model_is_refused() {
     let config = Config::preset("outdoor-tiny")
         .and_then(|config| config.with_toml("rays = 16\nhash.log2_size = 10", "test"))
         .unwrap();
-    let region = |radius: f64| Region {
-        center: DVec3::ZERO,
-        radius,
-        shape: RegionShape::Sphere,
-        how: "stated".into(),
-    };
     let gpu = Gpu::new(&GpuOptions::default()).unwrap();
-    let saved = Trainer::new(&gpu, &scene, &region(1.0), &config)
+    let saved = Trainer::new(&gpu, &scene, &sphere(1.0), &config)
         .and_then(|trainer| trainer.save(folder.path()))
         .unwrap();
     let checkpoint = Checkpoint::open(&saved).unwrap();
     let refusal = |radius: f64, setting: &str| {
         let config = config.clone().with_assignment(setting).unwrap();
-        let mut other = Trainer::new(&gpu, &scene, &region(radius), &config).unwrap();
+        let mut other = Trainer::new(&gpu, &scene, &sphere(radius), &config).unwrap();
         let error = other.restore(&checkpoint).unwrap_err();
         assert_eq!(error.exit_code(), 3);
         error.to_string()

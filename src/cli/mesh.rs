@@ -78,7 +78,7 @@ pub(super) fn run(args: &MeshArgs, context: &Context) -> anyhow::Result<()> {
         "run      {}, {} of {} steps, on {}",
         run.root().display(),
         trained.step,
-        trained.config.steps,
+        trained.config.total_steps(),
         gpu.info().name
     ));
     let world_from_region = trained.region.world_from_region();

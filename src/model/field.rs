@@ -63,6 +63,7 @@ pub struct Field {
 
 /// Kernels of the first output's gradient g = Jᵀ a.
 struct GradientKernels {
+    encoding: Kernel<field_forward::Args>,
     gradient: Kernel<field_gradient::Args>,
     tangent: Kernel<field_tangent::Args>,
     points: Kernel<field_point_backward::Args>,
@@ -212,8 +213,14 @@ impl Field {
             backward_inputs: 0,
             inputs_are_relu: false,
         };
+        let few_cores = gpu.info().few_cores;
+        let forward_part = |part, name: &str| -> Result<_> {
+            let shape = field_forward::Shape { part, ..forward };
+            Ok(gpu.kernel(shape)?.labelled(name))
+        };
         let by_chain_rule = match shape.gradient {
             true => Some(GradientKernels {
+                encoding: forward_part(1, &format!("{label} encoding"))?,
                 gradient: gpu
                     .kernel(field_gradient::Shape {
                         levels: grid_levels,
@@ -249,11 +256,6 @@ impl Field {
                 )?,
             }),
             false => None,
-        };
-        let few_cores = gpu.info().few_cores;
-        let forward_part = |part, name: &str| -> Result<_> {
-            let shape = field_forward::Shape { part, ..forward };
-            Ok(gpu.kernel(shape)?.labelled(name))
         };
         Ok(Field {
             table,
@@ -313,8 +315,57 @@ impl Field {
         buffers: &FieldBuffers,
         first: PtrMut<f32>,
     ) {
-        let n = buffers.n;
-        let args = field_forward::Args {
+        let args = self.forward_args(params, points, buffers, first);
+        let work = Work::items(u64::from(buffers.n));
+        let (interpolation, network) = (self.interpolation_flops(), self.hidden_flops());
+        let (gather, rows) = (self.gather_bytes(), 4.0 * f64::from(self.shape.inputs()));
+        match &self.forward {
+            Forward::Fused(kernel) => {
+                let work = work.flops(interpolation + network);
+                rec.run(kernel, work.bytes(gather + 2.0 * rows), args);
+            }
+            Forward::Parts(encoding, head) => {
+                rec.run(encoding, self.encoding_work(buffers.n), args);
+                rec.run(head, work.flops(network).bytes(rows), args);
+            }
+        }
+    }
+
+    /// Only the network's input at `points [3, n]`: enough for [`Field::gradient`], where nobody asks for the output.
+    pub fn encode(
+        &self,
+        rec: &mut Recorder,
+        params: &Params,
+        points: Ptr<f32>,
+        buffers: &FieldBuffers,
+    ) {
+        let unused = buffers.inputs.ptr_mut();
+        let args = self.forward_args(params, points, buffers, unused);
+        rec.run(
+            &self.kernels().encoding,
+            self.encoding_work(buffers.n),
+            args,
+        );
+    }
+
+    /// Encoding `n` points, a level in a slice.
+    fn encoding_work(&self, n: u32) -> Work {
+        let levels = f64::from(self.shape.grid.levels);
+        let rows = 4.0 * f64::from(self.shape.inputs());
+        Work::items(u64::from(n))
+            .slices(self.shape.grid.levels)
+            .flops(self.interpolation_flops() / levels)
+            .bytes((self.gather_bytes() + rows) / levels)
+    }
+
+    fn forward_args(
+        &self,
+        params: &Params,
+        points: Ptr<f32>,
+        buffers: &FieldBuffers,
+        first: PtrMut<f32>,
+    ) -> field_forward::Args {
+        field_forward::Args {
             levels: self.levels.ptr(),
             table: params.values().ptr().offset(self.table),
             hidden_weight: params.weight(self.hidden, 0),
@@ -325,29 +376,12 @@ impl Field {
             inputs: buffers.inputs.ptr_mut(),
             hidden: buffers.hidden.ptr_mut(),
             first,
-            n,
+            n: buffers.n,
             n_hidden: buffers.n_hidden,
-        };
-        let work = Work::items(u64::from(n));
-        let (interpolation, network) = (self.interpolation_flops(), self.hidden_flops());
-        let (gather, rows) = (self.gather_bytes(), 4.0 * f64::from(self.shape.inputs()));
-        match &self.forward {
-            Forward::Fused(kernel) => {
-                let work = work.flops(interpolation + network);
-                rec.run(kernel, work.bytes(gather + 2.0 * rows), args);
-            }
-            Forward::Parts(encoding, head) => {
-                let levels = f64::from(self.shape.grid.levels);
-                let by_level = work
-                    .slices(self.shape.grid.levels)
-                    .flops(interpolation / levels);
-                rec.run(encoding, by_level.bytes((gather + rows) / levels), args);
-                rec.run(head, work.flops(network).bytes(rows), args);
-            }
         }
     }
 
-    /// Gradient of the first output at the points of the last [`Field::forward`], into the buffers' `gradient`.
+    /// Gradient of the first output at the points of the last [`Field::forward`] or [`Field::encode`], into the buffers' `gradient`.
     pub fn gradient(
         &self,
         rec: &mut Recorder,

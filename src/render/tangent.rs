@@ -13,8 +13,7 @@ pub struct Tangent {
     pub loss: Buffer<f32>,   // [n]
     pub points: Buffer<f32>, // [3, n] beside the samples
     d_points: Buffer<f32>,   // [3, n]
-    sdf: Buffer<f32>,        // [n] there; nobody asks for it, so `d_sdf` stays zero
-    d_sdf: Buffer<f32>,      // [n]
+    d_sdf: Buffer<f32>,      // [n] zero: nobody asks for the signed distance there
     field: FieldBuffers,
     place: Kernel<tangent_points::Args>,
     compare: Kernel<tangent_loss::Args>,
@@ -33,7 +32,6 @@ impl Tangent {
             loss: gpu.scratch("tangent loss", n64)?,
             points: gpu.scratch("tangent points", 3 * n64)?,
             d_points: gpu.scratch("tangent d_points", 3 * n64)?,
-            sdf: gpu.scratch("tangent sdf", n64)?,
             d_sdf: gpu.buffer("tangent d_sdf", n64)?,
             field: FieldBuffers::new(gpu, "tangent", &Surface::field_shape(config), n, 0)?,
             place: gpu.kernel(tangent_points::Shape::default())?,
@@ -69,7 +67,7 @@ impl Tangent {
         };
         rec.run(&self.place, per_sample, args);
         let (params, field, points) = (&model.params, model.surface.beside(), self.points.ptr());
-        field.forward(rec, params, points, &self.field, self.sdf.ptr_mut());
+        field.encode(rec, params, points, &self.field);
         field.gradient(rec, params, points, &self.field);
         let args = tangent_loss::Args {
             gradient: at_samples.gradient.ptr(),
