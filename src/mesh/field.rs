@@ -22,13 +22,14 @@ pub struct Field<'m> {
     tap_draws: Buffer<f32>,  // [SHADE_BATCH]
     directions: Buffer<f32>, // [3, SHADE_BATCH]
     code: Buffer<u32>,       // [SHADE_BATCH] row of the appearance code for evaluation
-    tap_step: f32,
+    tap_range: f32,
+    near_step: f32,
 }
 
 /// Points of one pass of the signed distance, and of shading, which keeps seven times as much.
 const BATCH: u32 = 1 << 15;
 const SHADE_BATCH: u32 = 1 << 13;
-/// Distance of the gradient's taps at mesh vertices, in cells of the finest level: far enough for float32, near enough for detail.
+/// Distance of the taps of mesh vertices' normals, in cells of the finest level: far enough for float32, near enough for detail.
 const TAP_CELLS: f32 = 2.0;
 
 impl<'m> Field<'m> {
@@ -38,10 +39,8 @@ impl<'m> Field<'m> {
             model.params.normalise_weights(rec);
             Ok(())
         })?;
-        let (range, floor) = model.surface.taps();
-        let tap_step = (TAP_CELLS * 2.0 / config.hash.max as f32).max(floor);
-        let tap_draws = gpu.buffer("tap draws", u64::from(SHADE_BATCH))?;
-        gpu.upload(&tap_draws, 0, &vec![tap_step / range; SHADE_BATCH as usize])?;
+        let (tap_range, floor) = model.surface.taps();
+        let near_step = (TAP_CELLS * 2.0 / config.hash.max as f32).max(floor);
         let code = gpu.buffer("appearance row", u64::from(SHADE_BATCH))?;
         gpu.upload(&code, 0, &vec![model.n_views; SHADE_BATCH as usize])?;
         let shape = model.surface.field.shape.without_gradient();
@@ -54,9 +53,10 @@ impl<'m> Field<'m> {
             directions: gpu.buffer("view directions", 3 * u64::from(SHADE_BATCH))?,
             gpu: gpu.clone(),
             model,
-            tap_draws,
+            tap_draws: gpu.buffer("tap draws", u64::from(SHADE_BATCH))?,
             code,
-            tap_step,
+            tap_range,
+            near_step,
         })
     }
 
@@ -82,9 +82,17 @@ impl<'m> Field<'m> {
         Ok(distances)
     }
 
-    /// Uploads samples with their taps, if any, shades them as seen along `directions`, and returns colours and gradients.
-    fn shade(&mut self, points: &[[f32; 3]], directions: &[[f32; 3]]) -> Result<PointAttributes> {
+    /// Uploads samples with their taps, if any, `tap_step` away, shades them as seen along `directions`, and returns colours and
+    /// gradients.
+    fn shade(
+        &mut self,
+        points: &[[f32; 3]],
+        directions: &[[f32; 3]],
+        tap_step: f32,
+    ) -> Result<PointAttributes> {
         let n = SHADE_BATCH as usize;
+        self.gpu
+            .upload(&self.tap_draws, 0, &vec![tap_step / self.tap_range; n])?;
         let mut all = Vec::with_capacity(21 * n);
         for axis in 0..3 {
             for block in 0..self.model.surface.blocks() {
@@ -93,9 +101,9 @@ impl<'m> Field<'m> {
                 let offset = if !on_axis {
                     0.0
                 } else if block % 2 == 1 {
-                    self.tap_step
+                    tap_step
                 } else {
-                    -self.tap_step
+                    -tap_step
                 };
                 all.extend((0..n).map(|i| points.get(i).map_or(0.0, |p| p[axis]) + offset));
             }
@@ -188,7 +196,8 @@ impl SurfaceAttributes for Field<'_> {
             Vec::with_capacity(points.len()),
         );
         for chunk in points.chunks(SHADE_BATCH as usize) {
-            let (_, gradient) = self.shade(chunk, &vec![[0.0, 0.0, -1.0]; chunk.len()])?;
+            let any = vec![[0.0, 0.0, -1.0]; chunk.len()];
+            let (_, gradient) = self.shade(chunk, &any, self.near_step)?;
             let inward: Vec<[f32; 3]> = gradient
                 .iter()
                 .map(|&g| {
@@ -198,7 +207,8 @@ impl SurfaceAttributes for Field<'_> {
                         .to_array()
                 })
                 .collect();
-            let (rgb, gradient) = self.shade(chunk, &inward)?;
+            // The network knows colours by the gradients that it was trained with, those of taps at their mean distance.
+            let (rgb, _) = self.shade(chunk, &inward, 0.5 * self.tap_range)?;
             // The padding that compositing applies (METHOD 1.2).
             colors.extend(
                 rgb.into_iter()
