@@ -66,6 +66,7 @@ impl Trainer {
         let mut pace = Pace::default();
         pace.mark(self.step);
         let mut bad = BadSteps::default();
+        let mut surface = SurfaceWatch::default();
         let mut saved = (self.step, Instant::now());
         while self.step < end {
             self.step()?;
@@ -82,6 +83,10 @@ impl Trainer {
                 if step.is_multiple_of(report.log_steps) {
                     pace.mark(step);
                     stopping |= tell(told(losses, steps, pace.per_second()));
+                    if surface.is_lost(share_that_crosses(losses)) {
+                        let what = NO_SURFACE.into();
+                        stopping |= tell(Event::Warning { step, what });
+                    }
                 }
             }
             let last = step == end;
@@ -431,8 +436,35 @@ fn told(losses: &StepLosses, steps: u64, it_per_s: f64) -> Event {
             interlevel: of("interlevel"),
         },
         psnr: -10.0 * of("mse").log10(),
-        crossing: of("crossing"),
+        crossing: f64::from(share_that_crosses(losses)),
         it_per_s,
+    }
+}
+
+/// Share of a step's rays that meet an opaque surface.
+fn share_that_crosses(losses: &StepLosses) -> f32 {
+    let crossing = TERMS.iter().position(|term| *term == "crossing");
+    losses.values[crossing.expect("one of the terms")]
+}
+
+const NO_SURFACE: &str = "no ray meets a surface any more: pictures may still come out right, a mesh would be empty. Often the ground runs on \
+     beyond the region: try background.kind=field, or a larger --region-scale";
+
+/// Notices when there was a surface and there is none any more.
+#[derive(Default)]
+struct SurfaceWatch {
+    there: bool,
+}
+
+impl SurfaceWatch {
+    /// Fewer rays than this may miss a surface, or meet one, by chance.
+    const CLEARLY_THERE: f32 = 0.05;
+
+    /// Whether it has just gone, given the share of rays that meet it.
+    fn is_lost(&mut self, crossing: f32) -> bool {
+        let lost = self.there && crossing == 0.0;
+        self.there = crossing >= Self::CLEARLY_THERE || self.there && !lost;
+        lost
     }
 }
 
@@ -454,5 +486,19 @@ impl BadSteps {
             };
         }
         self.count >= BAD_STEPS
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::SurfaceWatch;
+
+    #[test]
+    fn a_lost_surface_is_told_once() {
+        let mut surface = SurfaceWatch::default();
+        let shares = [0.0, 0.01, 0.0, 0.2, 0.01, 0.0, 0.0, 0.3, 0.0];
+        let told: Vec<bool> = shares.map(|share| surface.is_lost(share)).into();
+        let at: Vec<usize> = (0..told.len()).filter(|&i| told[i]).collect();
+        assert_eq!(at, [5, 8]);
     }
 }
