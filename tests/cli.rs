@@ -417,9 +417,16 @@ fn a_run_from_photographs_to_mesh() {
     assert!(!root.join("run").exists());
 
     let whole = said(
-        train(&["--steps", "12", "--json", "--quiet"])
-            .output()
-            .unwrap(),
+        train(&[
+            "--steps",
+            "12",
+            "--set",
+            "report.log_steps=1",
+            "--json",
+            "--quiet",
+        ])
+        .output()
+        .unwrap(),
     );
     assert_eq!((whole.code, whole.stderr.as_str()), (Some(0), ""));
     let result: Value = serde_json::from_str(&whole.stdout).unwrap();
@@ -435,7 +442,7 @@ fn a_run_from_photographs_to_mesh() {
         assert!(run_folder.join(file).is_file(), "{file}");
     }
     let steps = logged(&run_folder, "step");
-    assert!(steps.len() >= 4, "{steps:?}");
+    assert!(steps.len() >= 5, "{steps:?}");
     assert!(
         steps
             .iter()
