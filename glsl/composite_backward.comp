@@ -1,32 +1,21 @@
 #version 460
 #include "lib/prelude.glsl"
-#include "lib/sampling.glsl"
 #include "lib/volume.glsl"
 // Adjoint of composite_forward's colour, one invocation per ray; every gradient is overwritten.
 //     g_i = d_color . (1.002 rgb_i - 0.001),  g_end = d_color . background                  what one unit of weight is worth
 //     D_i = g_i - g_{i+1} + e^-tau_{i+1} D_{i+1}, from g_n = g_end, D_n = 0                 and how much more than all that it hides
 //     d_tau_i = T_{i+1} D_i,  d_rgb_i = 1.002 w_i d_color,  d_background = T_end d_color
-// and through tau = sigma(sdf, inv_s(logit)) length. The textbook's T_{i+1} g_i - sum_{j>i} w_j g_j - T_end g_end is the same number, but
-// cancels where neighbours have nearly one colour.
+// The textbook's T_{i+1} g_i - sum_{j>i} w_j g_j - T_end g_end is the same number, but cancels where neighbours have nearly one colour.
 layout(push_constant, scalar) uniform Args {
-    F32s sdf;             // [n * n_samples] at bin starts
-    F32s logit;           // [n * n_samples] of the local scale
-    F32s edges;           // [n, n_samples + 1]
-    F32s near_far;        // [2, n]
-    U32s ray_outside;     // [n]
-    F32s rgb;             // [3, n * n_samples] in [0,1]
-    F32s background;      // [3, n]
-    F32s d_color;         // [3, n]
-    F32sMut d_sdf;        // [n * n_samples]
-    F32sMut d_logit;      // [n * n_samples]; zero where the lower bound of 1/beta acts
-    F32sMut d_rgb;        // [3, n * n_samples] with respect to the colour before padding
-    F32sMut d_background; // [3, n]
+    F32s optical_depth;      // [n * n_samples] tau
+    F32s rgb;                // [3, n * n_samples] in [0,1]
+    F32s background;         // [3, n]
+    F32s d_color;            // [3, n]
+    F32sMut d_optical_depth; // [n * n_samples]
+    F32sMut d_rgb;           // [3, n * n_samples] with respect to the colour before padding
+    F32sMut d_background;    // [3, n]
     uint n;
     uint n_samples;
-    float scale_range;
-    float scale_floor;
-    float inv_s_lower;
-    uint outside_empty;
 };
 
 void main() {
@@ -34,20 +23,13 @@ void main() {
     if (ray >= n) return;
     uint count = n * n_samples;
     uint row = ray * n_samples;
-    Span span = ray_span(near_far, n, ray);
-    bool empty = outside_empty != 0u && ray_outside.at[ray] != 0u;
 
-    // Forward: the transmittance after each sample, left in d_sdf until the way back overwrites it.
+    // Forward: the transmittance after each sample, left in d_optical_depth until the way back overwrites it.
     float tau_sum = 0.0, transmittance = 1.0;
-    float s0 = edges.at[row + ray];
     for (uint i = 0u; i < n_samples; i++) {
-        uint p = row + i;
-        float s1 = edges.at[p + ray + 1u];
-        float inv_s = local_scale(logit.at[p], scale_range, scale_floor, inv_s_lower).inv_s;
-        tau_sum += laplace_density(empty ? EMPTY_SDF : sdf.at[p], inv_s).sigma * bin_length(span, s0, s1);
+        tau_sum += optical_depth.at[row + i];
         transmittance = exp(-tau_sum);
-        d_sdf.at[p] = transmittance;
-        s0 = s1;
+        d_optical_depth.at[row + i] = transmittance;
     }
 
     vec3 d_pixel = vec3(d_color.at[ray], d_color.at[n + ray], d_color.at[2u * n + ray]);
@@ -58,17 +40,12 @@ void main() {
     // Backward.
     float next_worth = dot(d_pixel, behind); // g_{i+1}
     float passed = 0.0, advantage = 0.0;     // e^-tau_{i+1}, D_{i+1}
-    float s1 = s0;
     for (uint k = 0u; k < n_samples; k++) {
         uint i = n_samples - 1u - k;
         uint p = row + i;
-        s0 = edges.at[p + ray];
-        float bin = bin_length(span, s0, s1);
-        LocalScale scale = local_scale(logit.at[p], scale_range, scale_floor, inv_s_lower);
-        Density density = laplace_density(empty ? EMPTY_SDF : sdf.at[p], scale.inv_s);
-        float tau = density.sigma * bin;
+        float tau = optical_depth.at[p];
         float weight = opacity(tau);
-        if (i > 0u) weight *= d_sdf.at[p - 1u];
+        if (i > 0u) weight *= d_optical_depth.at[p - 1u];
 
         float worth = 0.0;
         [[unroll]] for (uint channel = 0u; channel < 3u; channel++) {
@@ -76,11 +53,8 @@ void main() {
             d_rgb.at[channel * count + p] = (1.0 + 2.0 * RGB_PADDING) * weight * d_pixel[channel];
         }
         advantage = worth - next_worth + passed * advantage;
-        float d_sigma = d_sdf.at[p] * advantage * bin;
-        d_sdf.at[p] = d_sigma * density.d_sdf;
-        d_logit.at[p] = d_sigma * density.d_inv_s * scale.d_logit;
+        d_optical_depth.at[p] *= advantage;
         next_worth = worth;
         passed = exp(-tau);
-        s1 = s0;
     }
 }

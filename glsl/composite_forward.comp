@@ -2,27 +2,21 @@
 #include "lib/prelude.glsl"
 #include "lib/sampling.glsl"
 #include "lib/volume.glsl"
-// From signed distances and colours to the picture, one invocation per ray (Mildenhall et al. 2020, NeRF, equation 3; density: lib/volume.glsl):
-//     tau_i = sigma_i length_i,  T_i = exp(-sum_{j<i} tau_j),  w_i = (1 - e^-tau_i) T_i
+// From optical depths and colours to the picture, one invocation per ray (Mildenhall et al. 2020, NeRF, equation 3):
+//     T_i = exp(-sum_{j<i} tau_j),  w_i = (1 - e^-tau_i) T_i
 //     color = sum_i w_i (1.002 rgb_i - 0.001) + T_end background,  accumulation = sum_i w_i = 1 - T_end
 //     depth = sum_i w_i (t_i + t_{i+1})/2 / (sum_i w_i + 1e-10)
 // T_end is the transmittance after the last sample.
 layout(push_constant, scalar) uniform Args {
-    F32s sdf;         // [n * n_samples] at bin starts (the first block of the taps' array)
-    F32s logit;       // [n * n_samples] of the local scale
-    F32s edges;       // [n, n_samples + 1]
-    F32s near_far;    // [2, n]
-    U32s ray_outside; // [n]
-    F32s rgb;         // [3, n * n_samples] in [0,1]
-    F32s background;  // [3, n]
-    F32sMut weights;  // [n, n_samples]
-    F32sMut image;    // [6, n]: red, green, blue, accumulation, T_end, depth (distance along the ray, region units)
+    F32s optical_depth; // [n * n_samples] tau
+    F32s edges;         // [n, n_samples + 1]
+    F32s near_far;      // [2, n]
+    F32s rgb;           // [3, n * n_samples] in [0,1]
+    F32s background;    // [3, n]
+    F32sMut weights;    // [n, n_samples]
+    F32sMut image;      // [6, n]: red, green, blue, accumulation, T_end, depth (distance along the ray, region units)
     uint n;
     uint n_samples;
-    float scale_range;
-    float scale_floor;
-    float inv_s_lower;  // the scheduled lower bound of 1/beta
-    uint outside_empty; // 1: rays outside the region are empty whatever the network says
 };
 
 void main() {
@@ -30,7 +24,6 @@ void main() {
     if (ray >= n) return;
     uint count = n * n_samples;
     Span span = ray_span(near_far, n, ray);
-    bool empty = outside_empty != 0u && ray_outside.at[ray] != 0u;
 
     float tau_sum = 0.0, transmittance = 1.0, weighted_distance = 0.0;
     vec3 color = vec3(0.0);
@@ -38,8 +31,7 @@ void main() {
     for (uint i = 0u; i < n_samples; i++) {
         uint p = ray * n_samples + i;
         float s1 = edges.at[p + ray + 1u];
-        float inv_s = local_scale(logit.at[p], scale_range, scale_floor, inv_s_lower).inv_s;
-        float tau = laplace_density(empty ? EMPTY_SDF : sdf.at[p], inv_s).sigma * bin_length(span, s0, s1);
+        float tau = optical_depth.at[p];
         float weight = opacity(tau) * transmittance;
         weights.at[p] = weight;
         color += weight * vec3(padded_rgb(rgb.at[p]), padded_rgb(rgb.at[count + p]), padded_rgb(rgb.at[2u * count + p]));

@@ -1,22 +1,26 @@
 #version 460
-// Adjoint of shade_forward, one sample per invocation: the gradient g hears from the colour network and from the eikonal loss
-// λ/B Σ(‖g‖ − 1)², and passes ±d_g/2δ on to the six SDF values; with ANALYTIC it adds d_g to what g hears from elsewhere.
+// Adjoint of shade_forward, one sample per invocation: the gradient g hears from the colour network, from the eikonal loss
+// λ/B Σ(‖g‖ − 1)² and, where the density or another loss reads it, from d_gradient. It passes that on to the taps' SDF values; without
+// taps it leaves it in d_gradient. The curvature loss reaches the SDF values on its own.
 #include "lib/prelude.glsl"
-#include "lib/sampling.glsl"
+#include "lib/taps.glsl"
 #include "lib/shading.glsl"
 
-layout(constant_id = 2) const uint ANALYTIC = 0;
+layout(constant_id = 3) const uint CURVATURE = 0;
+layout(constant_id = 4) const uint HEARD = 0;  // 1: d_gradient holds what g hears from elsewhere
 
 layout(push_constant, scalar) uniform Args {
-    F32s shading;     // [rows, n]
-    F32s d_shading;   // [rows, n]
-    F32s tap_draws;   // [n]
-    F32sMut d_sdf;    // [7, n]; blocks 1…6 written
-    F32sMut d_gradient; // [3, n] accumulated, with ANALYTIC
+    F32s sdf;           // [BLOCKS, n], read with CURVATURE
+    F32s shading;       // [rows, n]
+    F32s d_shading;     // [rows, n]
+    F32s tap_draws;     // [n]
+    F32sMut d_sdf;      // [BLOCKS, n]; the taps' blocks written, with CURVATURE added to block 0
+    F32sMut d_gradient; // [3, n]
     uint n;
     float tap_range;
     float tap_floor;
-    float eikonal_scale;  // λ/B
+    float eikonal_scale;    // λ/B
+    float curvature_scale;  // λ/B
 };
 
 void main() {
@@ -26,16 +30,22 @@ void main() {
     [[unroll]] for (uint c = 0u; c < 3u; ++c) {
         g[c] = shading.at[(ROW_GRADIENT + c) * n + p];
         d_g[c] = d_shading.at[(ROW_GRADIENT + c) * n + p];
+        if (HEARD != 0u) d_g[c] += d_gradient.at[c * n + p];
     }
     float norm = length(g);
     if (norm > 0.0) d_g += 2.0 * eikonal_scale * (norm - 1.0) / norm * g;
-    if (ANALYTIC != 0u) {
-        [[unroll]] for (uint c = 0u; c < 3u; ++c) d_gradient.at[c * n + p] += d_g[c];
+    if (TAPS == 0u) {
+        [[unroll]] for (uint c = 0u; c < 3u; ++c) d_gradient.at[c * n + p] = d_g[c];
         return;
     }
-    d_g *= 0.5 / tap_step(tap_draws.at[p], tap_range, tap_floor);
-    [[unroll]] for (uint c = 0u; c < 3u; ++c) {
-        d_sdf.at[(1u + 2u * c) * n + p] = d_g[c];
-        d_sdf.at[(2u + 2u * c) * n + p] = -d_g[c];
+    float delta = tap_step(tap_draws.at[p], tap_range, tap_floor);
+    float d_trace = 0.0;
+    if (CURVATURE != 0u) {
+        float trace = 0.0;
+        for (uint tap = 0u; tap < TAPS; ++tap) trace += sdf.at[(1u + tap) * n + p] - sdf.at[p];
+        d_trace = curvature_scale * sign(trace) * 6.0 / (float(TAPS) * delta * delta);
+        d_sdf.at[p] -= float(TAPS) * d_trace;
     }
+    d_g *= 3.0 / (float(TAPS) * delta);
+    for (uint tap = 0u; tap < TAPS; ++tap) d_sdf.at[(1u + tap) * n + p] = dot(tap_direction(tap), d_g) + d_trace;
 }

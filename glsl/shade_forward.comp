@@ -1,41 +1,49 @@
 #version 460
 // From the field's gradient at a sample to the colour network's input, one sample per invocation:
-//   g_j = [f(x + δe_j) − f(x − δe_j)] / 2δ from six taps, or with ANALYTIC from field_gradient (METHOD 3),  eikonal term (‖g‖ − 1)²  (METHOD 4.2),
+//   g from taps (lib/taps.glsl), or where there are none from field_gradient,  eikonal term (‖g‖ − 1)²  (METHOD 4.2),
+//   with CURVATURE its loss λ/B |trace of the Hessian| from the taps (METHOD 11),
 //   direction encoding sin(2ᵏd), sin(2ᵏd + π/2) for k = 0…3, then d (METHOD 2.7).
 #include "lib/prelude.glsl"
-#include "lib/sampling.glsl"
+#include "lib/taps.glsl"
 #include "lib/shading.glsl"
 
-layout(constant_id = 2) const uint ANALYTIC = 0;
-const uint BLOCKS = ANALYTIC != 0u ? 1u : 7u;  // of points: samples, then their taps
+layout(constant_id = 3) const uint CURVATURE = 0;
 
 layout(push_constant, scalar) uniform Args {
-    F32s sdf;          // [7, n] at the samples and their taps +x −x +y −y +z −z
+    F32s sdf;          // [BLOCKS, n] at the samples and their taps
     F32s tap_draws;    // [n]
-    F32s gradient;     // [3, n] with ANALYTIC, in place of the two above
+    F32s gradient;     // [3, n] without taps, in place of the two above
     F32s points;       // [3, BLOCKS * n]
     F32s directions;   // [3, n_rays]
     U32s ray_view;     // [n_rays]
     F32s appearance;   // [views, APPEARANCE]
     F32sMut shading;   // [rows, n]
     F32sMut eikonal;   // [n]
+    F32sMut curvature; // [n] with CURVATURE
     uint n;
     uint n_rays;
     float tap_range;
     float tap_floor;
+    float curvature_scale;  // λ/B
 };
 
 void main() {
     uint p = item();
     if (p >= n) return;
     uint ray = p / (n / n_rays);
-    vec3 g;
-    if (ANALYTIC != 0u) {
+    vec3 g = vec3(0.0);
+    if (TAPS == 0u) {
         g = vec3(gradient.at[p], gradient.at[n + p], gradient.at[2u * n + p]);
     } else {
-        float scale = 0.5 / tap_step(tap_draws.at[p], tap_range, tap_floor);
-        g = scale * vec3(sdf.at[n + p] - sdf.at[2u * n + p], sdf.at[3u * n + p] - sdf.at[4u * n + p],
-                         sdf.at[5u * n + p] - sdf.at[6u * n + p]);
+        float delta = tap_step(tap_draws.at[p], tap_range, tap_floor);
+        float trace = 0.0;
+        for (uint tap = 0u; tap < TAPS; ++tap) {
+            float f = sdf.at[(1u + tap) * n + p];
+            g += f * tap_direction(tap);
+            trace += f - sdf.at[p];
+        }
+        g *= 3.0 / (float(TAPS) * delta);
+        if (CURVATURE != 0u) curvature.at[p] = curvature_scale * abs(trace) * 6.0 / (float(TAPS) * delta * delta);
     }
     float excess = length(g) - 1.0;
     eikonal.at[p] = excess * excess;

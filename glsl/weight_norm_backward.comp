@@ -10,6 +10,7 @@ layout(push_constant, scalar) uniform Args {
     F32sMut d_weights;   // consumed
     F32sMut d_params;    // accumulated
     uint n;
+    uint released_columns;
 };
 
 void main() {
@@ -18,17 +19,18 @@ void main() {
     WeightRow row = rows.at[r];
     float square = 0.0;
     float along = 0.0;
+    uint acting = acting_columns(row, released_columns);
     for (uint i = 0u; i < row.columns; ++i) {
         float v = params.at[row.v + i];
         square = fma(v, v, square);
-        along = fma(v, d_weights.at[row.weight + i], along);
+        if (i < acting) along = fma(v, d_weights.at[row.weight + i], along);
     }
     float inverse = inversesqrt(square);
     along *= inverse;
     d_params.at[row.g] += along;
     float scale = params.at[row.g] * inverse;
     for (uint i = 0u; i < row.columns; ++i) {
-        d_params.at[row.v + i] += scale * (d_weights.at[row.weight + i] - along * inverse * params.at[row.v + i]);
+        d_params.at[row.v + i] += scale * ((i < acting ? d_weights.at[row.weight + i] : 0.0) - along * inverse * params.at[row.v + i]);
         d_weights.at[row.weight + i] = 0.0;
     }
 }

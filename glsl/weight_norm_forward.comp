@@ -8,6 +8,7 @@ layout(push_constant, scalar) uniform Args {
     F32s params;
     F32sMut weights;
     uint n;
+    uint released_columns;
 };
 
 void main() {
@@ -17,5 +18,6 @@ void main() {
     float square = 0.0;
     for (uint i = 0u; i < row.columns; ++i) square = fma(params.at[row.v + i], params.at[row.v + i], square);
     float scale = params.at[row.g] / sqrt(square);
-    for (uint i = 0u; i < row.columns; ++i) weights.at[row.weight + i] = scale * params.at[row.v + i];
+    uint acting = acting_columns(row, released_columns);
+    for (uint i = 0u; i < row.columns; ++i) weights.at[row.weight + i] = i < acting ? scale * params.at[row.v + i] : 0.0;
 }

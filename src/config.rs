@@ -11,7 +11,7 @@ mod resolve;
 mod validate;
 
 pub use difference::{Difference, Effect};
-pub use resolve::{PRESETS, Preset};
+pub use resolve::{HUGE, METHODS, Method, PRESETS, Preset};
 
 /// All settings of a training run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -19,6 +19,8 @@ pub use resolve::{PRESETS, Preset};
 pub struct Config {
     /// Name of the preset that this started from.
     pub preset: String,
+    /// Name of the method that the preset was combined with.
+    pub method: String,
     /// Seed of every random number: initial parameters, pixels, jitter, taps.
     pub seed: u32,
     /// Length of the stage. The schedules below are written for `schedule_steps` and stretched to this.
@@ -49,6 +51,7 @@ pub struct Stage2Config {
     /// Length of the stage; 0: there is none.
     pub steps: u64,
     pub rays: u32,
+    pub eikonal: f64,
     /// Weight of the tangent-normal loss.
     pub tangent: f64,
     pub scale_bound: ScaleBound,
@@ -67,8 +70,11 @@ impl Config {
         config.steps = stage2.steps;
         config.rays = stage2.rays;
         config.surface.gradient = GradientKind::Analytic;
+        config.surface.density = DensityKind::Sight;
+        config.loss.eikonal = stage2.eikonal;
         config.loss.bias.weight = 0.0;
         config.loss.bias.weight_start = 0.0;
+        config.loss.curvature.weight = 0.0;
         config.loss.tangent = stage2.tangent;
         config.loss.scale_bound = stage2.scale_bound.clone();
         config.stage2.steps = 0;
@@ -136,6 +142,18 @@ pub struct HashConfig {
     pub log2_size: u32,
     /// Features per level: 1, 2, 4 or 8.
     pub features: u32,
+    pub release: ReleaseConfig,
+}
+
+/// Coarse to fine: levels whose features are still hidden from the network (METHOD 11).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ReleaseConfig {
+    /// Levels seen from the beginning; 0: all.
+    pub first: u32,
+    /// One level more every `every` schedule steps after `start`.
+    pub start: u64,
+    pub every: u64,
 }
 
 /// The SDF network: one hidden softplus layer, heads for SDF, scale logit and geometry features.
@@ -149,24 +167,70 @@ pub struct SurfaceConfig {
     pub inside_out: bool,
     /// Radius-like bias of the geometric initialisation.
     pub init_bias: f64,
+    /// What hides what lies behind.
+    pub density: DensityKind,
+    /// Schedule steps over which NeuS's cosine hardens; 0: it is hard.
+    pub cosine_steps: u64,
+    /// Whose the scale is.
+    pub scale: ScaleKind,
     /// Range of the local scale β = scale_max·sigmoid(v) + scale_floor.
     pub scale_max: f64,
-    /// Floor of the local scale.
+    /// Floor of β.
     pub scale_floor: f64,
+    /// First value of a global scale.
+    pub scale_init: f64,
+    /// Rate of the exponential scale 1/β = e^(scale_rate v).
+    pub scale_rate: f64,
     /// How the SDF's gradient is had.
     pub gradient: GradientKind,
-    /// Taps lie U(0, tap_range) away, floored at a quarter of the finest cell.
+    /// Points around a sample: 6 or 4.
+    pub taps: u32,
+    /// How far away they lie.
+    pub tap_step: TapStepKind,
+    /// Random taps lie U(0, tap_range) away, floored at a quarter of the finest cell of [0, 1]³.
     pub tap_range: f64,
 }
 
-/// How the gradient of the signed distance is had, and with it what the density is a function of (METHOD 3, 2.5).
+/// How the gradient of the signed distance is had (METHOD 3).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum GradientKind {
-    /// Central differences at a random distance; density of the signed distance (stage 1).
+    /// Finite differences (stage 1).
     Taps,
-    /// The chain rule; density of the signed distance along the line of sight (stage 2).
+    /// The chain rule (stage 2).
     Analytic,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum TapStepKind {
+    /// One draw per sample (NeuRodin).
+    Random,
+    /// A quarter of the cell of the finest level that is released (Neuralangelo).
+    Level,
+}
+
+/// What the optical depth of a bin is a function of (METHOD 2.5, 11).
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum DensityKind {
+    /// Laplace density of the signed distance (VolSDF; stage 1).
+    Laplace,
+    /// Laplace density of the signed distance along the line of sight (TUVR; stage 2).
+    Sight,
+    /// NeuS's opacity.
+    Neus,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum ScaleKind {
+    /// Every point has its own (NeuRodin).
+    Local,
+    /// One β = |v| + scale_floor (VolSDF).
+    Beta,
+    /// One 1/β = e^(scale_rate v) (NeuS).
+    Exponential,
 }
 
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -250,9 +314,19 @@ pub struct LossConfig {
     pub interlevel: f64,
     /// Tangent-normal consistency (METHOD 4.5); needs the analytic gradient.
     pub tangent: f64,
+    pub curvature: CurvatureConfig,
     pub bias: BiasConfig,
     /// Lower bound of 1/β from `start` to `end` over `steps` schedule steps.
     pub scale_bound: ScaleBound,
+}
+
+/// Mean |trace of the SDF's Hessian|, from taps (METHOD 11).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CurvatureConfig {
+    /// Rises from 0 to this over `warmup` schedule steps, then falls by the grid's growth with every level released.
+    pub weight: f64,
+    pub warmup: u64,
 }
 
 /// Explicit bias correction (METHOD 4.3).

@@ -3,7 +3,7 @@
 mod reference;
 
 use reference::background::{self, Background};
-use reference::batch::{Outcome, Stage, Step, StepConfig};
+use reference::batch::{Density, Outcome, Scale, Stage, Step, StepConfig};
 use reference::hash_grid::Grid;
 use reference::losses::{self, BiasReduction};
 use reference::networks::{NormedLayer, spherical_harmonics};
@@ -72,14 +72,14 @@ fn check_gradients(mut step: Step, stage: &Stage, seed: u64) {
 
 #[test]
 fn gradients_outdoors_with_one_background_color() {
-    check_gradients(trial::step(trial::config(), 24, 1), &Stage::Taps, 2);
+    check_gradients(trial::step(trial::config(), 24, 1), &Stage::first(), 2);
 }
 
 #[test]
 fn gradients_outdoors_with_a_background_field() {
     for contraction in [true, false] {
         let step = trial::step(with_background_field(contraction), 24, 3);
-        check_gradients(step, &Stage::Taps, 4);
+        check_gradients(step, &Stage::first(), 4);
     }
 }
 
@@ -96,7 +96,7 @@ fn with_background_field(contraction: bool) -> StepConfig {
 
 #[test]
 fn gradients_indoors() {
-    check_gradients(indoors(), &Stage::Taps, 6);
+    check_gradients(indoors(), &Stage::first(), 6);
 }
 
 /// A step whose scale bound holds for half of the samples.
@@ -118,6 +118,52 @@ fn indoors() -> Step {
     scales.sort_by(f64::total_cmp);
     step.now.inv_s_lower = scales[scales.len() / 2];
     step
+}
+
+/// What the other methods are made of, in combinations that differ in everything.
+#[test]
+fn gradients_of_other_methods() {
+    let neuralangelo = Stage {
+        taps: 4,
+        density: Density::Neus,
+        bias: false,
+        tangent: None,
+    };
+    let mut step = one_scale(Scale::Exponential { rate: 2.0 }, 31);
+    step.now.curvature_weight = 1e-3;
+    step.now.released_levels = 3;
+    step.now.cosine_anneal = 0.6;
+    check_gradients(step.clone(), &neuralangelo, 32);
+    let six = Stage {
+        taps: 6,
+        ..neuralangelo.clone()
+    };
+    check_gradients(step.clone(), &six, 33);
+    step.now.curvature_weight = 0.0;
+    let neus = Stage {
+        taps: 0,
+        ..neuralangelo
+    };
+    check_gradients(step, &neus, 34);
+    let volsdf = Stage {
+        density: Density::Laplace,
+        ..neus
+    };
+    check_gradients(one_scale(Scale::Beta, 35), &volsdf, 36);
+    let with_bias = Stage {
+        bias: true,
+        ..volsdf
+    };
+    check_gradients(trial::step(trial::config(), 24, 1), &with_bias, 38);
+}
+
+/// A step with one scale for all samples.
+fn one_scale(scale: Scale, seed: u64) -> Step {
+    let config = StepConfig {
+        scale,
+        ..trial::config()
+    };
+    trial::step(config, 24, seed)
 }
 
 #[test]
@@ -191,6 +237,7 @@ fn analytic_gradient_of_the_surface() {
             hidden: layer("surface.hidden"),
             heads: layer("surface.heads"),
             table: put("surface.table"),
+            released: step.config.grid.levels.len() - 1,
         };
         let x = tape.parameter(points.len(), 3, points.as_flattened().to_vec());
         let (heads, gradient) = field.heads_and_gradient(tape, &step.config.grid, x);
@@ -227,7 +274,7 @@ fn analytic_gradient_of_the_surface() {
 fn given_points_are_taken_as_they_are() {
     let mut step = trial::step(trial::config(), 6, 20);
     let second = trial::second_stage(&step, 21);
-    for stage in [Stage::Taps, second] {
+    for stage in [Stage::first(), second] {
         step.stage = stage;
         step.points = None;
         let own = step.run();

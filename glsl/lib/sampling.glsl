@@ -44,8 +44,3 @@ float bin_length(Span span, float s0, float s1) {
 float bin_midpoint(Span span, float s0, float s1) {
     return 0.5 * (distance_at(span, s0) + distance_at(span, s1));
 }
-
-// How far the six taps lie from their sample: U(0, range), not below the floor (Wang et al. 2024, NeuRodin).
-float tap_step(float u, float range, float floor_) {
-    return max(range * u, floor_);
-}

@@ -5,5 +5,11 @@ struct WeightRow {
     uint g;        // its length, in the parameter block
     uint weight;   // first element of the row's effective weights
     uint columns;
+    uint released; // 1: columns of hash levels that are not released yet are switched off
 };
 layout(buffer_reference, scalar) readonly buffer WeightRows { WeightRow at[]; };
+
+// The columns that act: a level that is switched off has no effect, and hears nothing.
+uint acting_columns(WeightRow row, uint released_columns) {
+    return row.released != 0u ? min(row.columns, released_columns) : row.columns;
+}

@@ -388,7 +388,7 @@ impl<'c> Demo<'c> {
             steepest: Some(4.0),
             ..ExtractOptions::default()
         };
-        let mut field = Field::new(gpu, trainer.config(), trainer.model())?;
+        let mut field = Field::new(gpu, trainer.config(), trainer.model(), trainer.annealed())?;
         let mut shown: Option<(mesh::extract::Stage, Progress)> = None;
         let mesh = mesh::extract_mesh(&mut field, &options, &mut |now| {
             if shown.as_ref().is_none_or(|(stage, _)| *stage != now.stage) {

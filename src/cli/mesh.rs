@@ -140,7 +140,7 @@ fn surface(
     context: &Context,
 ) -> anyhow::Result<(Mesh, extract::ExtractStats)> {
     let interrupted = interrupt::flag("stopping")?;
-    let mut field = Field::new(gpu, &trained.config, &trained.model)?;
+    let mut field = Field::new(gpu, &trained.config, &trained.model, trained.annealed())?;
     let mut stage = None;
     let mut shown: Option<Progress> = None;
     let mut tell = |progress: extract::Progress| {

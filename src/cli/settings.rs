@@ -1,17 +1,20 @@
 //! The flags that make a configuration; shared by every command that trains.
 
-use crate::config::{Config, PRESETS};
+use crate::config::{Config, HUGE, METHODS, PRESETS};
 use crate::{Error, Result};
 use clap::Args;
 use std::path::PathBuf;
 
-/// Where settings come from, weakest first: preset, file, environment, flags.
+/// Where settings come from, weakest first: preset, method, file, environment, flags.
 #[derive(Args, Clone, Debug, Default)]
 #[command(next_help_heading = "Settings")]
 pub(super) struct SettingsArgs {
     /// Named settings to start from; without it a tiny preset for the kind of scene
     #[arg(long, value_name = "NAME", env = "NEURODIN_PRESET", long_help = preset_help())]
     pub preset: Option<String>,
+    /// Method that the preset is set to
+    #[arg(long, value_name = "NAME", env = "NEURODIN_METHOD", long_help = method_help())]
+    pub method: Option<String>,
     /// TOML file of settings that differ from the preset
     #[arg(long, value_name = "FILE", env = "NEURODIN_CONFIG")]
     pub config: Option<PathBuf>,
@@ -37,6 +40,16 @@ fn preset_help() -> String {
     for preset in PRESETS {
         text += &format!("\n  {:<14} {}", preset.name, preset.summary);
     }
+    text += &format!("\n\nWith {HUGE} behind its name, the same with a dictionary of 2^22.");
+    text
+}
+
+/// The methods with what they are.
+fn method_help() -> String {
+    let mut text = String::from("Method that the preset is set to\n");
+    for method in METHODS {
+        text += &format!("\n  {:<14} {}", method.name, method.summary);
+    }
     text
 }
 
@@ -50,6 +63,9 @@ impl SettingsArgs {
             Some(name) => Config::preset(name)?,
             None => base,
         };
+        if let Some(name) = &self.method {
+            config = config.with_method(name)?;
+        }
         if let Some(path) = &self.config {
             let source = path.display().to_string();
             let text = std::fs::read_to_string(path).map_err(|error| {

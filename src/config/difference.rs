@@ -33,10 +33,15 @@ impl fmt::Display for Difference {
 /// Groups and keys after whose change a checkpoint cannot be used.
 const INCOMPATIBLE: &[&str] = &[
     "scene.",
-    "hash.",
+    "hash.levels",
+    "hash.base",
+    "hash.max",
+    "hash.log2_size",
+    "hash.features",
     "surface.hidden",
     "surface.features",
     "surface.inside_out",
+    "surface.scale",
     "color.",
     "appearance.dims",
     "sampling.proposal_levels",

@@ -45,6 +45,77 @@ pub const PRESETS: &[Preset] = &[
     },
 ];
 
+/// A method that the engine can be set to; what it changes of a preset.
+#[derive(Clone, Copy, Debug)]
+pub struct Method {
+    pub name: &'static str,
+    /// What it is, in one line.
+    pub summary: &'static str,
+    toml: &'static str,
+}
+
+/// Every method (METHOD 7, 11), NeuRodin first.
+pub const METHODS: &[Method] = &[
+    Method {
+        name: "neurodin",
+        summary: "NeuRodin as the preset has it",
+        toml: "",
+    },
+    Method {
+        name: "volsdf-grid",
+        summary: "VolSDF on a hash grid",
+        toml: include_str!("methods/volsdf-grid.toml"),
+    },
+    Method {
+        name: "tuvr-grid",
+        summary: "TUVR on a hash grid",
+        toml: include_str!("methods/tuvr-grid.toml"),
+    },
+    Method {
+        name: "neus-grid",
+        summary: "NeuS on a hash grid",
+        toml: include_str!("methods/neus-grid.toml"),
+    },
+    Method {
+        name: "neuralangelo",
+        summary: "Neuralangelo with four taps",
+        toml: include_str!("methods/neuralangelo.toml"),
+    },
+    Method {
+        name: "neuralangelo-6",
+        summary: "Neuralangelo with six taps",
+        toml: include_str!("methods/neuralangelo-6.toml"),
+    },
+    Method {
+        name: "ablation-a",
+        summary: "NeuRodin with one scale for all points",
+        toml: include_str!("methods/ablation-a.toml"),
+    },
+    Method {
+        name: "ablation-b",
+        summary: "NeuRodin with an analytic gradient in stage 1",
+        toml: include_str!("methods/ablation-b.toml"),
+    },
+    Method {
+        name: "ablation-c",
+        summary: "NeuRodin without bias correction",
+        toml: include_str!("methods/ablation-c.toml"),
+    },
+    Method {
+        name: "ablation-d",
+        summary: "NeuRodin without eikonal loss in stage 1",
+        toml: include_str!("methods/ablation-d.toml"),
+    },
+    Method {
+        name: "ablation-e",
+        summary: "NeuRodin without eikonal loss, and with an analytic gradient, in stage 1",
+        toml: include_str!("methods/ablation-e.toml"),
+    },
+];
+
+/// What a preset's name ends with for the same at the largest dictionary, 2^22.
+pub const HUGE: &str = "-huge";
+
 /// The complete, commented configuration; also the template of [`Config::to_toml`].
 const COMPLETE: &str = include_str!("presets/outdoor-large.toml");
 
@@ -55,11 +126,17 @@ impl Default for Config {
 }
 
 impl Config {
-    /// The configuration of a preset.
+    /// The configuration of a preset, or with the ending [`HUGE`] the same with 2^22 entries in every hashed level.
     ///
     /// # Errors
     /// [`Error::Config`] for an unknown name, with the nearest one.
     pub fn preset(name: &str) -> Result<Config> {
+        if let Some(base) = name.strip_suffix(HUGE) {
+            let mut config = Config::preset(base)?;
+            config.preset = name.into();
+            config.hash.log2_size = 22;
+            return Ok(config);
+        }
         let Some(preset) = PRESETS.iter().find(|preset| preset.name == name) else {
             let hint = match nearest(name, PRESETS.iter().map(|preset| preset.name)) {
                 Some(near) => format!("did you mean '{near}'? "),
@@ -68,7 +145,7 @@ impl Config {
             let all: Vec<_> = PRESETS.iter().map(|preset| preset.name).collect();
             return Err(Error::Config {
                 what: format!(
-                    "unknown preset '{name}'; {hint}there are: {}",
+                    "unknown preset '{name}'; {hint}there are: {}, and each of them with {HUGE}",
                     all.join(", ")
                 ),
             });
@@ -76,6 +153,38 @@ impl Config {
         let complete = Table::try_from(Config::default()).expect("a configuration is a table");
         let table = parse(preset.toml, preset.name)?;
         overlay(complete, &table, &format!("preset {name}"))
+    }
+
+    /// This configuration set to another method. A preset at its full length stays at that of the method; one that is stretched, and a
+    /// method with one stage, take all the steps of all stages.
+    ///
+    /// # Errors
+    /// [`Error::Config`] for an unknown name, with the nearest one.
+    pub fn with_method(self, name: &str) -> Result<Config> {
+        let Some(method) = METHODS.iter().find(|method| method.name == name) else {
+            let hint = match nearest(name, METHODS.iter().map(|method| method.name)) {
+                Some(near) => format!("did you mean '{near}'? "),
+                None => String::new(),
+            };
+            let all: Vec<_> = METHODS.iter().map(|method| method.name).collect();
+            return Err(Error::Config {
+                what: format!(
+                    "unknown method '{name}'; {hint}there are: {}",
+                    all.join(", ")
+                ),
+            });
+        };
+        let (total, full_length) = (self.total_steps(), self.steps == self.schedule_steps);
+        let table = Table::try_from(self).expect("a configuration is a table");
+        let source = format!("method {name}");
+        let mut config = overlay(table, &parse(method.toml, &source)?, &source)?;
+        if config.stage2.steps == 0 {
+            config.steps = match full_length {
+                true => config.schedule_steps,
+                false => total,
+            };
+        }
+        Ok(config)
     }
 
     /// The configuration in a TOML text, which may be partial: its key `preset` (default: outdoor-large) says what it differs from.
@@ -106,13 +215,18 @@ impl Config {
         base.with_toml(text, source)
     }
 
-    /// This configuration with a partial TOML text laid over it; ranges are not checked yet.
+    /// This configuration, with the method that a partial TOML text may name, and the text laid over it; ranges are not checked yet.
     ///
     /// # Errors
     /// As [`Config::from_toml`].
     pub fn with_toml(self, text: &str, source: &str) -> Result<Config> {
-        let table = Table::try_from(self).expect("a configuration is a table");
-        overlay(table, &parse(text, source)?, source)
+        let text = parse(text, source)?;
+        let config = match text.get("method") {
+            Some(Value::String(method)) => self.with_method(method)?,
+            _ => self,
+        };
+        let table = Table::try_from(config).expect("a configuration is a table");
+        overlay(table, &text, source)
     }
 
     /// This configuration with one assignment `group.key=value` made; ranges are not checked yet. Values are written as in TOML,
@@ -129,9 +243,9 @@ impl Config {
             });
         };
         let (key, text) = (key.trim(), text.trim());
-        if key == "preset" {
+        if key == "preset" || key == "method" {
             return Err(Error::Config {
-                what: format!("the preset is not a setting among others; use --preset {text}"),
+                what: format!("the {key} is not a setting among others; use --{key} {text}"),
             });
         }
         let mut table = Table::try_from(self).expect("a configuration is a table");
@@ -321,7 +435,7 @@ fn check(table: Table, key: &str, value: &str) -> Result<Config> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::{BackgroundKind, Effect, RegionKind};
+    use crate::config::{BackgroundKind, DensityKind, Effect, RegionKind};
 
     fn complaint(result: Result<Config>) -> String {
         let error = result.expect_err("a complaint");
@@ -338,6 +452,46 @@ mod tests {
             assert!(text.contains("# of every random number"), "comments stay");
             assert_eq!(Config::from_toml(&text, "text").unwrap(), config);
         }
+    }
+
+    #[test]
+    fn methods_are_sound_on_every_preset() {
+        for preset in PRESETS {
+            for method in METHODS {
+                let start = Config::preset(preset.name).unwrap();
+                let total = start.total_steps();
+                let config = start.with_method(method.name).unwrap().validated().unwrap();
+                assert_eq!(
+                    (config.preset.as_str(), config.method.as_str()),
+                    (preset.name, method.name)
+                );
+                let own_length = config.steps == config.schedule_steps;
+                assert!(own_length || config.total_steps() == total);
+                if let Some(second) = config.second_stage() {
+                    second.validated().unwrap();
+                }
+                let text = config.to_toml();
+                assert_eq!(Config::from_toml(&text, "text").unwrap(), config);
+            }
+        }
+        let partial = "preset = 'outdoor-tiny'\nmethod = 'neus-grid'\nrays = 8\n";
+        let config = Config::from_toml(partial, "text").unwrap();
+        assert_eq!(
+            (config.rays, config.surface.density),
+            (8, DensityKind::Neus)
+        );
+        let told = complaint(Config::default().with_method("neus"));
+        assert!(told.contains("did you mean 'neus-grid'?"), "{told}");
+    }
+
+    #[test]
+    fn huge_presets_differ_in_the_dictionary_alone() {
+        let mut huge = Config::preset("indoor-tiny-huge").unwrap();
+        assert_eq!(huge.hash.log2_size, 22);
+        huge.hash.log2_size = 17;
+        huge.preset = "indoor-tiny".into();
+        assert_eq!(huge, Config::preset("indoor-tiny").unwrap());
+        assert!(complaint(Config::preset("indor-tiny-huge")).contains("'indoor-tiny'"));
     }
 
     /// The numbers that distinguish the published configurations (METHOD 1.1).

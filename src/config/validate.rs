@@ -1,6 +1,6 @@
 //! Ranges: which settings the kernels and the method accept. Each complaint gives key, value and range.
 
-use super::{BackgroundKind, Config, GradientKind, MultiStep, ScaleBound};
+use super::{BackgroundKind, Config, GradientKind, MultiStep, ScaleBound, ScaleKind};
 use crate::{Error, Result};
 use std::fmt::Display;
 
@@ -34,12 +34,40 @@ impl Config {
             hash.log2_size,
             hash.features,
         );
+        wrong.whole("hash.release.first", hash.release.first, 0, 16);
+        wrong.whole("hash.release.every", hash.release.every, 1, 100_000_000);
         wrong.network("surface.hidden", self.surface.hidden);
         wrong.whole("surface.features", self.surface.features, 1, 256);
         wrong.real("surface.init_bias", self.surface.init_bias, 0.0, 10.0);
         wrong.real("surface.scale_max", self.surface.scale_max, 1e-4, 10.0);
         wrong.real("surface.scale_floor", self.surface.scale_floor, 1e-6, 1.0);
+        match self.surface.scale {
+            ScaleKind::Local => {}
+            ScaleKind::Beta => {
+                wrong.real("surface.scale_init", self.surface.scale_init, 1e-4, 10.0);
+            }
+            ScaleKind::Exponential => {
+                wrong.real("surface.scale_init", self.surface.scale_init, -10.0, 10.0);
+                wrong.real("surface.scale_rate", self.surface.scale_rate, 1e-3, 100.0);
+            }
+        }
+        if ![4, 6].contains(&self.surface.taps) {
+            wrong.add("surface.taps", self.surface.taps, "4 or 6");
+        }
         wrong.real("surface.tap_range", self.surface.tap_range, 1e-6, 1.0);
+        wrong.real(
+            "loss.curvature.weight",
+            self.loss.curvature.weight,
+            0.0,
+            1e3,
+        );
+        if self.loss.curvature.weight > 0.0 && self.surface.gradient != GradientKind::Taps {
+            wrong.add(
+                "loss.curvature.weight",
+                self.loss.curvature.weight,
+                "0 where surface.gradient is not \"taps\"",
+            );
+        }
         wrong.real("loss.tangent", self.loss.tangent, 0.0, 1e3);
         if self.loss.tangent > 0.0 && self.surface.gradient != GradientKind::Analytic {
             wrong.add(
@@ -94,6 +122,7 @@ impl Config {
         let loss = &self.loss;
         wrong.real("loss.eikonal", loss.eikonal, 0.0, 1e3);
         wrong.real("loss.interlevel", loss.interlevel, 0.0, 1e3);
+        wrong.real("stage2.eikonal", self.stage2.eikonal, 0.0, 1e3);
         wrong.real("loss.bias.weight", loss.bias.weight, 0.0, 1e3);
         wrong.real("loss.bias.weight_start", loss.bias.weight_start, 0.0, 1e3);
         wrong.real("loss.bias.epsilon", loss.bias.epsilon, 0.0, 1.0);

@@ -7,7 +7,8 @@ use crate::Result;
 use crate::config::Config;
 use crate::gpu::{Buffer, Gpu, Kernel, Work};
 use crate::kernels::lattice_points;
-use crate::model::{FieldBuffers, Model, ShadeInputs, SurfaceBuffers};
+use crate::model::{FieldBuffers, Model, ShadeInputs, SurfaceBuffers, TapStep};
+use crate::render::Annealed;
 
 /// Evaluates a model at points of the region frame.
 pub struct Field<'m> {
@@ -19,10 +20,11 @@ pub struct Field<'m> {
     /// Grows to the largest block asked for.
     distances: Buffer<f32>,
     surface: SurfaceBuffers,
-    tap_draws: Buffer<f32>,  // [SHADE_BATCH]
+    tap_draws: Buffer<f32>, // [SHADE_BATCH] without effect: the distance is given
     directions: Buffer<f32>, // [3, SHADE_BATCH]
-    code: Buffer<u32>,       // [SHADE_BATCH] row of the appearance code for evaluation
-    tap_range: f32,
+    code: Buffer<u32>,      // [SHADE_BATCH] row of the appearance code for evaluation
+    /// The taps' mean distance in training: colours belong to such gradients.
+    color_step: f32,
     near_step: f32,
 }
 
@@ -33,14 +35,12 @@ const SHADE_BATCH: u32 = 1 << 13;
 const TAP_CELLS: f32 = 2.0;
 
 impl<'m> Field<'m> {
-    /// Buffers and kernels to ask `model`, which was built with `config`.
-    pub fn new(gpu: &Gpu, config: &Config, model: &'m Model) -> Result<Field<'m>> {
+    /// Buffers and kernels to ask `model`, which was built with `config`, as it is at the time `now`.
+    pub fn new(gpu: &Gpu, config: &Config, model: &'m Model, now: Annealed) -> Result<Field<'m>> {
         gpu.submit("weights", |rec| {
-            model.params.normalise_weights(rec);
+            model.refresh_weights(rec, now.released_levels);
             Ok(())
         })?;
-        let (tap_range, floor) = model.surface.taps();
-        let near_step = (TAP_CELLS * 2.0 / config.hash.max as f32).max(floor);
         let code = gpu.buffer("appearance row", u64::from(SHADE_BATCH))?;
         gpu.upload(&code, 0, &vec![model.n_views; SHADE_BATCH as usize])?;
         let shape = model.surface.field.shape.without_gradient();
@@ -55,8 +55,8 @@ impl<'m> Field<'m> {
             model,
             tap_draws: gpu.buffer("tap draws", u64::from(SHADE_BATCH))?,
             code,
-            tap_range,
-            near_step,
+            color_step: (0.5 * now.tap_step.range).max(now.tap_step.floor),
+            near_step: TAP_CELLS * 2.0 / config.hash.max as f32,
         })
     }
 
@@ -91,20 +91,10 @@ impl<'m> Field<'m> {
         tap_step: f32,
     ) -> Result<PointAttributes> {
         let n = SHADE_BATCH as usize;
-        self.gpu
-            .upload(&self.tap_draws, 0, &vec![tap_step / self.tap_range; n])?;
         let mut all = Vec::with_capacity(21 * n);
         for axis in 0..3 {
-            for block in 0..self.model.surface.blocks() {
-                // Blocks after the first: +x −x +y −y +z −z.
-                let on_axis = block > 0 && (block - 1) / 2 == axis as u32;
-                let offset = if !on_axis {
-                    0.0
-                } else if block % 2 == 1 {
-                    tap_step
-                } else {
-                    -tap_step
-                };
+            let taps = self.model.surface.tap_directions().iter();
+            for offset in std::iter::once(0.0).chain(taps.map(|tap| tap_step * tap[axis])) {
                 all.extend((0..n).map(|i| points.get(i).map_or(0.0, |p| p[axis]) + offset));
             }
         }
@@ -113,6 +103,11 @@ impl<'m> Field<'m> {
             .upload(&self.directions, 0, &planar(directions, n))?;
         let inputs = ShadeInputs {
             tap_draws: self.tap_draws.ptr(),
+            tap_step: TapStep {
+                range: 0.0,
+                floor: tap_step,
+            },
+            curvature_scale: 0.0,
             directions: self.directions.ptr(),
             ray_view: self.code.ptr(),
             n_rays: SHADE_BATCH,
@@ -208,7 +203,7 @@ impl SurfaceAttributes for Field<'_> {
                 })
                 .collect();
             // The network knows colours by the gradients that it was trained with, those of taps at their mean distance.
-            let (rgb, _) = self.shade(chunk, &inward, 0.5 * self.tap_range)?;
+            let (rgb, _) = self.shade(chunk, &inward, self.color_step)?;
             // The padding that compositing applies (METHOD 1.2).
             colors.extend(
                 rgb.into_iter()

@@ -15,11 +15,11 @@ pub use hash_grid::HashGrid;
 pub use layer::{Activation, Layer};
 pub use params::{Group, Init, Params, ParamsPlan, Span, WeightHandle};
 pub use proposal::{Proposal, ProposalBuffers};
-pub use surface::{ShadeInputs, Surface, SurfaceBuffers};
+pub use surface::{ShadeInputs, Surface, SurfaceBuffers, TapStep};
 
 use crate::Result;
 use crate::config::Config;
-use crate::gpu::Gpu;
+use crate::gpu::{Gpu, Recorder};
 
 /// Everything that is learned.
 pub struct Model {
@@ -54,6 +54,18 @@ impl Model {
             background,
             n_views,
         })
+    }
+
+    /// Refreshes the networks' effective weights, with so many levels of the surface's grid released.
+    pub fn refresh_weights(&self, rec: &mut Recorder, released_levels: u32) {
+        let columns = self.surface.released_columns(released_levels);
+        self.params.normalise_weights(rec, columns);
+    }
+
+    /// Folds the effective weights' gradients back into the parameters'; after [`Model::refresh_weights`] with as many levels.
+    pub fn fold_gradients(&self, rec: &mut Recorder, released_levels: u32) {
+        let columns = self.surface.released_columns(released_levels);
+        self.params.fold_gradients(rec, columns);
     }
 
     /// Sets the appearance code that evaluation uses: zero, which it is at first, or the mean of the views' codes.

@@ -118,7 +118,8 @@ impl ParamsPlan {
         first
     }
 
-    /// Adds a weight-normalised matrix `[rows, columns]` (spans `name.v`, `name.g`, `name.bias`); g starts as ‖v‖.
+    /// Adds a weight-normalised matrix `[rows, columns]` (spans `name.v`, `name.g`, `name.bias`); g starts as ‖v‖. `released`: its last
+    /// columns belong to hash levels that the network may not see yet.
     pub fn add_normalised(
         &mut self,
         group: Group,
@@ -126,6 +127,7 @@ impl ParamsPlan {
         columns: u64,
         v: Vec<f32>,
         bias: Vec<f32>,
+        released: bool,
     ) -> WeightHandle {
         let rows = bias.len() as u64;
         let lengths: Vec<f32> = v
@@ -152,6 +154,7 @@ impl ParamsPlan {
                 g: (g_first + row) as u32,
                 weight: (weight + row * columns) as u32,
                 columns: columns as u32,
+                released: u32::from(released),
             });
         }
         self.effective_len = (weight + rows * columns).next_multiple_of(ALIGNMENT);
@@ -342,25 +345,27 @@ impl Params {
         learning.expect("a model that was built to be trained")
     }
 
-    /// Refreshes the effective weights from v and g.
-    pub fn normalise_weights(&self, rec: &mut Recorder) {
+    /// Refreshes the effective weights from v and g. `released_columns`: of matrices with release, those that act.
+    pub fn normalise_weights(&self, rec: &mut Recorder, released_columns: u32) {
         let args = weight_norm_forward::Args {
             rows: self.row_table.ptr(),
             params: self.values.ptr(),
             weights: self.effective.ptr_mut(),
             n: self.n_rows as u32,
+            released_columns,
         };
         rec.run(&self.forward, Work::items(self.n_rows), args);
     }
 
     /// Folds the effective weights' gradients back into v and g.
-    pub fn fold_gradients(&self, rec: &mut Recorder) {
+    pub fn fold_gradients(&self, rec: &mut Recorder, released_columns: u32) {
         let args = weight_norm_backward::Args {
             rows: self.row_table.ptr(),
             params: self.values.ptr(),
             d_weights: self.d_effective.ptr_mut(),
             d_params: self.grads().ptr_mut(),
             n: self.n_rows as u32,
+            released_columns,
         };
         rec.run(&self.backward, Work::items(self.n_rows), args);
     }

@@ -1,4 +1,4 @@
-//! The surface: SDF, local scale, geometry features and the colour network (METHOD 2.4, 2.5, 2.7).
+//! The surface: SDF, scale, geometry features and the colour network (METHOD 2.4, 2.5, 2.7).
 
 use super::appearance::add_codes;
 use super::field::{Field, FieldBuffers, FieldShape, Scratch};
@@ -6,9 +6,11 @@ use super::hash_grid::HashGrid;
 use super::layer::{Activation, Layer, LayerShape};
 use super::params::{Draws, Group, Init, Params, ParamsPlan};
 use crate::Result;
-use crate::config::{Config, GradientKind};
+use crate::config::{Config, DensityKind, GradientKind, ScaleKind};
 use crate::gpu::{Buffer, Gpu, Kernel, Ptr, PtrMut, Recorder, Work};
-use crate::kernels::{appearance_backward, shade_backward, shade_forward, sigmoid_backward};
+use crate::kernels::{
+    appearance_backward, global_scale_backward, shade_backward, shade_forward, sigmoid_backward,
+};
 
 /// Parameters and kernels of the surface's networks.
 pub struct Surface {
@@ -26,14 +28,18 @@ pub struct Surface {
     shade_backward: Kernel<shade_backward::Args>,
     sigmoid_backward: Kernel<sigmoid_backward::Args>,
     appearance_backward: Kernel<appearance_backward::Args>,
-    tap_range: f32,
-    tap_floor: f32,
+    global_scale_backward: Kernel<global_scale_backward::Args>,
+    /// Element offset of the scale that all samples share, if they do.
+    global_scale: Option<u64>,
+    /// Points around a sample; 0 where the gradient is analytic.
+    taps: u32,
+    gradient_is_heard: bool,
 }
 
-/// Activations of the surface at `n` samples and where the gradient comes from taps at six points around each: 1 or 7 blocks of points.
+/// Activations of the surface at `n` samples and at the taps around each: 1, 5 or 7 blocks of points.
 pub struct SurfaceBuffers {
     pub n: u32,
-    pub points: Buffer<f32>, // [3, blocks * n] samples, then taps +x −x +y −y +z −z
+    pub points: Buffer<f32>, // [3, blocks * n] samples, then taps (glsl/lib/taps.glsl)
     pub field: FieldBuffers, // of all points
     pub sdf: Buffer<f32>,    // [blocks, n]
     pub d_sdf: Buffer<f32>,  // [blocks, n]
@@ -41,14 +47,27 @@ pub struct SurfaceBuffers {
     pub d_shading: Buffer<f32>, // [rows that receive gradients, n]
     pub hidden: Vec<Buffer<f32>>, // per hidden colour layer [width, n]
     pub d_hidden: Vec<Buffer<f32>>,
-    pub rgb: Buffer<f32>,     // [3, n] sigmoid output, not padded
-    pub d_rgb: Buffer<f32>,   // [3, n]
-    pub eikonal: Buffer<f32>, // [n]
+    pub rgb: Buffer<f32>,       // [3, n] sigmoid output, not padded
+    pub d_rgb: Buffer<f32>,     // [3, n]
+    pub eikonal: Buffer<f32>,   // [n]
+    pub curvature: Buffer<f32>, // [n] weighted, where there is a curvature loss
+    /// What the taps' gradient hears from the density, where that reads it.
+    tap_d_gradient: Option<Buffer<f32>>, // [3, n]
+}
+
+/// Distance of the taps from their sample: max(range·u, floor) for a draw u, in region units.
+#[derive(Clone, Copy, Debug)]
+pub struct TapStep {
+    pub range: f32,
+    pub floor: f32,
 }
 
 /// Samples' companions that shading reads.
 pub struct ShadeInputs {
-    pub tap_draws: Ptr<f32>,  // [n]
+    pub tap_draws: Ptr<f32>, // [n]
+    pub tap_step: TapStep,
+    /// λ/B of the curvature loss.
+    pub curvature_scale: f32,
     pub directions: Ptr<f32>, // [3, n_rays]
     pub ray_view: Ptr<u32>,   // [n_rays]
     pub n_rays: u32,
@@ -101,6 +120,7 @@ impl Surface {
             u64::from(inputs),
             v,
             vec![0.0; hidden as usize],
+            true,
         );
         let sign = if config.surface.inside_out { -1.0 } else { 1.0 };
         let mean = sign * (std::f64::consts::PI / f64::from(hidden)).sqrt();
@@ -109,8 +129,18 @@ impl Surface {
             .map(|_| draws.normal(mean, 1e-4))
             .collect();
         let bias = vec![(-sign * config.surface.init_bias) as f32; rows as usize];
-        let heads_weight =
-            plan.add_normalised(Group::Fields, "surface.heads", u64::from(hidden), v, bias);
+        let heads_weight = plan.add_normalised(
+            Group::Fields,
+            "surface.heads",
+            u64::from(hidden),
+            v,
+            bias,
+            false,
+        );
+        let global_scale = (config.surface.scale != ScaleKind::Local).then(|| {
+            let first = vec![config.surface.scale_init as f32];
+            plan.add(Group::Fields, "surface.scale", &[1], Init::Values(first))
+        });
 
         let appearance_dims = config.appearance.dims;
         let color_inputs = geometry + 3 + appearance_dims + 3 + DIRECTION_ENCODING;
@@ -131,7 +161,7 @@ impl Surface {
             let v = (0..n_in * n_out).map(|_| draws.symmetric(bound)).collect();
             let bias = (0..n_out).map(|_| draws.symmetric(bound)).collect();
             let name = format!("color.{layer}");
-            let handle = plan.add_normalised(Group::Fields, &name, u64::from(n_in), v, bias);
+            let handle = plan.add_normalised(Group::Fields, &name, u64::from(n_in), v, bias, false);
             let shape = LayerShape {
                 inputs: n_in,
                 outputs: n_out,
@@ -174,6 +204,9 @@ impl Surface {
             backward_inputs: hidden,
             inputs_are_relu: false,
         };
+        let taps = Self::blocks_of(config) - 1;
+        let curvature = u32::from(config.loss.curvature.weight > 0.0);
+        let gradient_is_heard = Self::gradient_is_heard(config);
         Ok(Surface {
             field: Field::new(gpu, "surface", shape, table, hidden_weight, heads_weight)?,
             probes: Field::new(
@@ -203,23 +236,50 @@ impl Surface {
             shade_forward: gpu.kernel(shade_forward::Shape {
                 geometry,
                 appearance: appearance_dims,
-                analytic: u32::from(shape.gradient),
+                taps,
+                curvature,
             })?,
             shade_backward: gpu.kernel(shade_backward::Shape {
                 geometry,
                 appearance: appearance_dims,
-                analytic: u32::from(shape.gradient),
+                taps,
+                curvature,
+                heard: u32::from(gradient_is_heard),
             })?,
             sigmoid_backward: gpu.kernel(sigmoid_backward::Shape::default())?,
             appearance_backward: gpu.kernel(appearance_backward::Shape::default())?,
-            tap_range: config.surface.tap_range as f32,
-            tap_floor: 0.25 / config.hash.max as f32,
+            global_scale_backward: gpu.kernel(global_scale_backward::Shape::default())?,
+            global_scale,
+            taps,
+            gradient_is_heard,
         })
     }
 
-    /// Range and floor of the tap distance δ = max(range·u, floor).
-    pub fn taps(&self) -> (f32, f32) {
-        (self.tap_range, self.tap_floor)
+    /// Directions of the taps, unit vectors, as glsl/lib/taps.glsl has them.
+    pub fn tap_directions(&self) -> &'static [[f32; 3]] {
+        const CORNER: f32 = 0.577_350_3;
+        match self.taps {
+            4 => &[
+                [CORNER, -CORNER, -CORNER],
+                [-CORNER, -CORNER, CORNER],
+                [-CORNER, CORNER, -CORNER],
+                [CORNER, CORNER, CORNER],
+            ],
+            6 => &[
+                [1.0, 0.0, 0.0],
+                [-1.0, 0.0, 0.0],
+                [0.0, 1.0, 0.0],
+                [0.0, -1.0, 0.0],
+                [0.0, 0.0, 1.0],
+                [0.0, 0.0, -1.0],
+            ],
+            _ => &[],
+        }
+    }
+
+    /// Columns of the hidden layer that act while so many levels of the grid are released.
+    pub fn released_columns(&self, levels: u32) -> u32 {
+        3 + levels * self.field.shape.grid.features
     }
 
     /// The field that the tangent-normal loss asks.
@@ -230,14 +290,17 @@ impl Surface {
         self.beside.as_ref().expect("a field with a gradient")
     }
 
-    /// Points per sample: 1, or 7 with taps.
+    /// Points per sample: itself and its taps.
     pub fn blocks(&self) -> u32 {
-        Self::blocks_of(&self.field.shape)
+        1 + self.taps
     }
 
     /// As [`Surface::blocks`], before there is a surface.
-    pub fn blocks_of(shape: &FieldShape) -> u32 {
-        if shape.gradient { 1 } else { 7 }
+    pub fn blocks_of(config: &Config) -> u32 {
+        match config.surface.gradient {
+            GradientKind::Taps => 1 + config.surface.taps,
+            GradientKind::Analytic => 1,
+        }
     }
 
     fn gradient_rows(&self) -> u32 {
@@ -268,6 +331,11 @@ impl Surface {
             rgb: gpu.scratch("rgb", 3 * n64)?,
             d_rgb: gpu.scratch("d_rgb", 3 * n64)?,
             eikonal: gpu.scratch("eikonal", n64)?,
+            curvature: gpu.scratch("curvature", n64)?,
+            tap_d_gradient: match self.taps > 0 && self.gradient_is_heard {
+                true => Some(gpu.scratch("tap d_gradient", 3 * n64)?),
+                false => None,
+            },
         })
     }
 
@@ -301,10 +369,12 @@ impl Surface {
             appearance: params.values().ptr().offset(self.appearance),
             shading: b.shading.ptr_mut(),
             eikonal: b.eikonal.ptr_mut(),
+            curvature: b.curvature.ptr_mut(),
             n: b.n,
             n_rays: inputs.n_rays,
-            tap_range: self.tap_range,
-            tap_floor: self.tap_floor,
+            tap_range: inputs.tap_step.range,
+            tap_floor: inputs.tap_step.floor,
+            curvature_scale: inputs.curvature_scale,
         };
         rec.run(
             &self.shade_forward,
@@ -319,7 +389,8 @@ impl Surface {
         }
     }
 
-    /// Adds all gradients, from `b.d_rgb`, `b.d_sdf` block 0 and the logit's row 0 of `b.d_shading`. `eikonal_scale` is λ/B.
+    /// Adds all gradients, from `b.d_rgb`, `b.d_sdf` block 0, the scale's row 0 of `b.d_shading` and [`Surface::d_gradient`].
+    /// `eikonal_scale` is λ/B.
     pub fn backward(
         &self,
         rec: &mut Recorder,
@@ -330,6 +401,15 @@ impl Surface {
         eikonal_scale: f32,
     ) {
         let n = b.n;
+        if let Some(scale) = self.global_scale {
+            let args = global_scale_backward::Args {
+                d_scale: self.d_scale(b),
+                d_parameter: params.grads().ptr_mut().offset(scale),
+                n,
+            };
+            let work = Work::items(1).bytes(8.0 * f64::from(n));
+            rec.run(&self.global_scale_backward, work, args);
+        }
         let work = Work::items(3 * u64::from(n));
         let args = sigmoid_backward::Args {
             y: b.rgb.ptr(),
@@ -351,18 +431,17 @@ impl Surface {
             d_y = d_x.read();
         }
         let args = shade_backward::Args {
+            sdf: b.sdf.ptr(),
             shading: b.shading.ptr(),
             d_shading: b.d_shading.ptr(),
             tap_draws: inputs.tap_draws,
             d_sdf: b.d_sdf.ptr_mut(),
-            d_gradient: match self.field.shape.gradient {
-                true => b.field.slope().d_gradient.ptr_mut(),
-                false => b.d_sdf.ptr_mut(),
-            },
+            d_gradient: self.d_gradient(b),
             n,
-            tap_range: self.tap_range,
-            tap_floor: self.tap_floor,
+            tap_range: inputs.tap_step.range,
+            tap_floor: inputs.tap_step.floor,
             eikonal_scale,
+            curvature_scale: inputs.curvature_scale,
         };
         rec.run(
             &self.shade_backward,
@@ -417,8 +496,37 @@ impl Surface {
         u64::from(1 + self.geometry) * u64::from(b.n)
     }
 
-    /// Where row 0 of the shading gradients, the scale logit's, is to be written.
-    pub fn d_logit(&self, b: &SurfaceBuffers) -> PtrMut<f32> {
+    /// The scale: `[n]` logits, or `[1]` where all samples share one.
+    pub fn scale(&self, params: &Params, b: &SurfaceBuffers) -> Ptr<f32> {
+        match self.global_scale {
+            Some(scale) => params.values().ptr().offset(scale),
+            None => b.shading.ptr(),
+        }
+    }
+
+    /// Where the scale's gradients `[n]` are to be written, row 0 of the shading gradients; of a shared one the summands.
+    pub fn d_scale(&self, b: &SurfaceBuffers) -> PtrMut<f32> {
         b.d_shading.ptr_mut()
+    }
+
+    /// Whether the SDF's gradient hears from elsewhere than shading: an analytic one may hear from other losses, any from a density that
+    /// is a function of it.
+    pub fn gradient_is_heard(config: &Config) -> bool {
+        config.surface.gradient == GradientKind::Analytic
+            || config.surface.density != DensityKind::Laplace
+    }
+
+    /// The SDF's gradient at the samples, `[3, n]`.
+    pub fn gradient(&self, b: &SurfaceBuffers) -> Ptr<f32> {
+        b.shading.ptr().offset(self.gradient_row(b))
+    }
+
+    /// Where what the gradient hears from elsewhere than shading is to be written, `[3, n]`; any valid address where nobody listens.
+    pub fn d_gradient(&self, b: &SurfaceBuffers) -> PtrMut<f32> {
+        match (&b.tap_d_gradient, self.field.shape.gradient) {
+            (Some(of_taps), _) => of_taps.ptr_mut(),
+            (None, true) => b.field.slope().d_gradient.ptr_mut(),
+            (None, false) => b.d_sdf.ptr_mut(),
+        }
     }
 }

@@ -1,14 +1,15 @@
-//! From samples to pixels and back: local scale, Laplace density, quadrature (METHOD 2.5, 2.6).
+//! From samples to pixels and back: optical depth and quadrature (METHOD 2.5, 2.6, 11).
 
 use super::rays::Rays;
+use super::renderer::Annealed;
 use super::sampler::Sampler;
 use crate::Result;
-use crate::config::{BackgroundKind, Config, GradientKind};
-use crate::gpu::{Buffer, Gpu, Kernel, Ptr, Recorder, Work};
+use crate::config::{BackgroundKind, Config, DensityKind, ScaleKind};
+use crate::gpu::{Buffer, Gpu, Kernel, Recorder, Work};
 use crate::kernels::{
-    composite_backward, composite_forward, normal_map, sight_distance, sight_distance_backward,
+    composite_backward, composite_forward, normal_map, optical_depth, optical_depth_backward,
 };
-use crate::model::{BackgroundBuffers, Surface, SurfaceBuffers};
+use crate::model::{BackgroundBuffers, Model, Surface, SurfaceBuffers};
 
 /// Kernels and results of compositing a batch.
 pub struct Composite {
@@ -18,17 +19,12 @@ pub struct Composite {
     forward: Kernel<composite_forward::Args>,
     backward: Kernel<composite_backward::Args>,
     normal_map: Kernel<normal_map::Args>,
-    sight: Option<Sight>,
+    optical_depth: Buffer<f32>, // [n_rays, n_samples]
+    optical_depth_forward: Kernel<optical_depth::Args>,
+    optical_depth_backward: Kernel<optical_depth_backward::Args>,
     scale_range: f32,
     scale_floor: f32,
     outside_empty: u32,
-}
-
-/// What turns signed distances into those along the line of sight, where the density is a function of these (METHOD 2.5, stage 2).
-struct Sight {
-    distance: Buffer<f32>, // [n]
-    forward: Kernel<sight_distance::Args>,
-    backward: Kernel<sight_distance_backward::Args>,
 }
 
 /// Everything that compositing reads of a batch.
@@ -37,8 +33,7 @@ pub struct Look<'a> {
     pub sampler: &'a Sampler,
     pub surface: &'a SurfaceBuffers,
     pub background: &'a BackgroundBuffers,
-    /// Lower bound of 1/β.
-    pub inv_s_lower: f32,
+    pub now: Annealed,
 }
 
 impl Composite {
@@ -49,6 +44,16 @@ impl Composite {
             geometry: config.surface.features,
             appearance: config.appearance.dims,
         };
+        let density = match config.surface.density {
+            DensityKind::Laplace => 0,
+            DensityKind::Sight => 1,
+            DensityKind::Neus => 2,
+        };
+        let scale = match config.surface.scale {
+            ScaleKind::Local => 0,
+            ScaleKind::Beta => 1,
+            ScaleKind::Exponential => 2,
+        };
         Ok(Composite {
             weights: gpu.scratch("weights", n * samples)?,
             image: gpu.scratch("image", 6 * n)?,
@@ -56,104 +61,96 @@ impl Composite {
             forward: gpu.kernel(composite_forward::Shape::default())?,
             backward: gpu.kernel(composite_backward::Shape::default())?,
             normal_map: gpu.kernel(shading)?,
-            sight: match config.surface.gradient {
-                GradientKind::Taps => None,
-                GradientKind::Analytic => Some(Sight {
-                    distance: gpu.scratch("sight distance", n * samples)?,
-                    forward: gpu.kernel(sight_distance::Shape::default())?,
-                    backward: gpu.kernel(sight_distance_backward::Shape::default())?,
-                }),
-            },
-            scale_range: config.surface.scale_max as f32,
+            optical_depth: gpu.scratch("optical depth", n * samples)?,
+            optical_depth_forward: gpu.kernel(optical_depth::Shape { density, scale })?,
+            optical_depth_backward: gpu.kernel(optical_depth_backward::Shape {
+                density,
+                scale,
+                gradient: u32::from(Surface::gradient_is_heard(config)),
+            })?,
+            scale_range: match config.surface.scale {
+                ScaleKind::Exponential => config.surface.scale_rate,
+                _ => config.surface.scale_max,
+            } as f32,
             scale_floor: config.surface.scale_floor as f32,
             outside_empty: u32::from(config.background.kind != BackgroundKind::None),
         })
     }
 
     /// Weights and pixels.
-    pub fn forward(&self, rec: &mut Recorder, look: &Look) {
+    pub fn forward(&self, rec: &mut Recorder, look: &Look, model: &Model) {
         let (n, n_samples) = (look.rays.n, look.sampler.n_samples);
-        if let Some(sight) = &self.sight {
-            let args = sight_distance::Args {
-                sdf: look.surface.sdf.ptr(),
-                gradient: look.surface.field.slope().gradient.ptr(),
-                directions: look.rays.directions.ptr(),
-                distance_: sight.distance.ptr_mut(),
-                n: n * n_samples,
-                n_rays: n,
-            };
-            rec.run(&sight.forward, per_sample(n, n_samples), args);
-        }
-        let args = composite_forward::Args {
-            sdf: self.distance(look),
-            logit: look.surface.shading.ptr(),
+        let surface = look.surface;
+        let args = optical_depth::Args {
+            sdf: surface.sdf.ptr(),
+            gradient: model.surface.gradient(surface),
+            scale: model.surface.scale(&model.params, surface),
+            directions: look.rays.directions.ptr(),
             edges: look.sampler.edges.ptr(),
             near_far: look.rays.near_far.ptr(),
             ray_outside: look.rays.outside.ptr(),
-            rgb: look.surface.rgb.ptr(),
+            optical_depth: self.optical_depth.ptr_mut(),
+            n_rays: n,
+            n_samples,
+            scale_range: self.scale_range,
+            scale_floor: self.scale_floor,
+            inv_s_lower: look.now.inv_s_lower,
+            anneal: look.now.cosine_anneal,
+            outside_empty: self.outside_empty,
+        };
+        rec.run(&self.optical_depth_forward, per_sample(n, n_samples), args);
+        let args = composite_forward::Args {
+            optical_depth: self.optical_depth.ptr(),
+            edges: look.sampler.edges.ptr(),
+            near_far: look.rays.near_far.ptr(),
+            rgb: surface.rgb.ptr(),
             background: look.background.color.ptr(),
             weights: self.weights.ptr_mut(),
             image: self.image.ptr_mut(),
             n,
             n_samples,
-            scale_range: self.scale_range,
-            scale_floor: self.scale_floor,
-            inv_s_lower: look.inv_s_lower,
-            outside_empty: self.outside_empty,
         };
         rec.run(&self.forward, per_ray(n, n_samples), args);
     }
 
-    /// Gradients of SDF (block 0), scale logit, colour and background, and where the density knows the viewing angle of the surface's
-    /// gradient, from `d_color [3, n_rays]`.
-    pub fn backward(
-        &self,
-        rec: &mut Recorder,
-        look: &Look,
-        model: &Surface,
-        d_color: &Buffer<f32>,
-    ) {
+    /// Gradients of SDF (block 0), scale, colour and background, and where the density reads it, of the SDF's gradient, from
+    /// `d_color [3, n_rays]`.
+    pub fn backward(&self, rec: &mut Recorder, look: &Look, model: &Model, d_color: &Buffer<f32>) {
         let (n, n_samples) = (look.rays.n, look.sampler.n_samples);
+        let surface = look.surface;
         let args = composite_backward::Args {
-            sdf: self.distance(look),
-            logit: look.surface.shading.ptr(),
-            edges: look.sampler.edges.ptr(),
-            near_far: look.rays.near_far.ptr(),
-            ray_outside: look.rays.outside.ptr(),
-            rgb: look.surface.rgb.ptr(),
+            optical_depth: self.optical_depth.ptr(),
+            rgb: surface.rgb.ptr(),
             background: look.background.color.ptr(),
             d_color: d_color.ptr(),
-            d_sdf: look.surface.d_sdf.ptr_mut(),
-            d_logit: model.d_logit(look.surface),
-            d_rgb: look.surface.d_rgb.ptr_mut(),
+            // Left where the SDF's own gradient will take its place.
+            d_optical_depth: surface.d_sdf.ptr_mut(),
+            d_rgb: surface.d_rgb.ptr_mut(),
             d_background: look.background.d_color.ptr_mut(),
             n,
             n_samples,
-            scale_range: self.scale_range,
-            scale_floor: self.scale_floor,
-            inv_s_lower: look.inv_s_lower,
-            outside_empty: self.outside_empty,
         };
         rec.run(&self.backward, per_ray(n, 2 * n_samples), args);
-        if let Some(sight) = &self.sight {
-            let slope = look.surface.field.slope();
-            let args = sight_distance_backward::Args {
-                sdf: look.surface.sdf.ptr(),
-                gradient: slope.gradient.ptr(),
-                directions: look.rays.directions.ptr(),
-                d_distance: look.surface.d_sdf.ptr_mut(),
-                d_gradient: slope.d_gradient.ptr_mut(),
-                n: n * n_samples,
-                n_rays: n,
-            };
-            rec.run(&sight.backward, per_sample(n, n_samples), args);
-        }
-    }
-
-    /// What the density is a function of: `[n]` signed distances, or those along the line of sight.
-    fn distance(&self, look: &Look) -> Ptr<f32> {
-        let along_sight = self.sight.as_ref().map(|sight| sight.distance.ptr());
-        along_sight.unwrap_or(look.surface.sdf.ptr())
+        let args = optical_depth_backward::Args {
+            sdf: surface.sdf.ptr(),
+            gradient: model.surface.gradient(surface),
+            scale: model.surface.scale(&model.params, surface),
+            directions: look.rays.directions.ptr(),
+            edges: look.sampler.edges.ptr(),
+            near_far: look.rays.near_far.ptr(),
+            ray_outside: look.rays.outside.ptr(),
+            d_sdf: surface.d_sdf.ptr_mut(),
+            d_scale: model.surface.d_scale(surface),
+            d_gradient: model.surface.d_gradient(surface),
+            n_rays: n,
+            n_samples,
+            scale_range: self.scale_range,
+            scale_floor: self.scale_floor,
+            inv_s_lower: look.now.inv_s_lower,
+            anneal: look.now.cosine_anneal,
+            outside_empty: self.outside_empty,
+        };
+        rec.run(&self.optical_depth_backward, per_sample(n, n_samples), args);
     }
 
     /// Rendered normals, into `self.normals`.

@@ -8,14 +8,15 @@ use crate::gpu::{Buffer, Gpu, Kernel, Ptr, Recorder, Work};
 use crate::kernels::{LossTerm, bias_correction, color_loss, heaviest_sample, sum_losses};
 use crate::model::{FieldBuffers, Model, Scratch, Surface};
 
-/// Names of the summed terms, in order; the total of the first six follows as the last number.
-pub const TERMS: [&str; 8] = [
+/// Names of the summed terms, in order; the total of the first seven follows as the last number.
+pub const TERMS: [&str; 9] = [
     "color",
     "eikonal",
     "interlevel_0",
     "interlevel_1",
     "bias",
     "tangent",
+    "curvature",
     "mse",
     "crossing",
 ];
@@ -190,6 +191,7 @@ impl Loss {
         gpu: &Gpu,
         eikonal: &Buffer<f32>,
         interlevel: &[Buffer<f32>],
+        curvature: Option<&Buffer<f32>>,
         weights: LossScales,
     ) -> Result<()> {
         let per_ray = 1.0 / self.n_rays as f32;
@@ -210,6 +212,10 @@ impl Loss {
             term(self.bias.ptr(), n, 1.0, 1), // weighted where it is computed: its weight changes with time
             match &self.tangent {
                 Some(tangent) => term(tangent.loss.ptr(), n_all, weights.tangent / n_all as f32, 1),
+                None => term(self.bias.ptr(), 0, 0.0, 1),
+            },
+            match curvature {
+                Some(curvature) => term(curvature.ptr(), n_all, 1.0, 1), // weighted likewise
                 None => term(self.bias.ptr(), 0, 0.0, 1),
             },
             term(self.square.ptr(), n, per_ray, 0),

@@ -5,7 +5,9 @@ use super::rays::{RayDraws, Rays, ViewTable};
 use super::sampler::Sampler;
 use crate::config::Config;
 use crate::gpu::{Gpu, Recorder};
-use crate::model::{BackgroundBuffers, BackgroundRays, Model, ShadeInputs, SurfaceBuffers};
+use crate::model::{
+    BackgroundBuffers, BackgroundRays, Model, ShadeInputs, SurfaceBuffers, TapStep,
+};
 use crate::scene::Region;
 use crate::{Error, Result};
 
@@ -38,8 +40,15 @@ pub struct Rendered {
 pub struct Annealed {
     /// Exponent of the proposal weights.
     pub anneal: f32,
-    /// Lower bound of 1/β.
+    /// Lower bound of the local 1/β.
     pub inv_s_lower: f32,
+    /// How hard NeuS's cosine is, 0 to 1.
+    pub cosine_anneal: f32,
+    pub tap_step: TapStep,
+    /// Levels of the surface's grid that its network sees.
+    pub released_levels: u32,
+    /// Weight of the curvature loss, which is computed on the way.
+    pub curvature_weight: f32,
 }
 
 /// Purposes of random numbers.
@@ -68,20 +77,22 @@ impl Renderer {
     }
 
     /// What compositing reads.
-    pub fn look(&self, inv_s_lower: f32) -> Look<'_> {
+    pub fn look(&self, now: Annealed) -> Look<'_> {
         Look {
             rays: &self.rays,
             sampler: &self.sampler,
             surface: &self.surface,
             background: &self.background,
-            inv_s_lower,
+            now,
         }
     }
 
     /// What shading reads beside the points.
-    pub fn shade_inputs(&self) -> ShadeInputs {
+    pub fn shade_inputs(&self, now: Annealed) -> ShadeInputs {
         ShadeInputs {
             tap_draws: self.draws.per_sample(),
+            tap_step: now.tap_step,
+            curvature_scale: now.curvature_weight / self.surface.n as f32,
             directions: self.rays.directions.ptr(),
             ray_view: self.rays.view.ptr(),
             n_rays: self.rays.n,
@@ -108,20 +119,20 @@ impl Renderer {
             model,
             &self.rays,
             &self.draws,
-            now.anneal,
+            now,
             train,
             &self.surface.points,
         );
         model
             .surface
-            .forward(rec, &model.params, &self.surface, &self.shade_inputs());
+            .forward(rec, &model.params, &self.surface, &self.shade_inputs(now));
         model.background.forward(
             rec,
             &model.params,
             &self.background,
             &self.background_rays(train),
         );
-        self.composite.forward(rec, &self.look(now.inv_s_lower));
+        self.composite.forward(rec, &self.look(now), model);
     }
 
     /// Renders a whole view of `width`×`height` pixels. Depth is the distance along the ray in region units. `keep_going` is asked
@@ -155,12 +166,12 @@ impl Renderer {
                 });
             }
             gpu.submit("view", |rec| {
-                model.params.normalise_weights(rec);
+                model.refresh_weights(rec, now.released_levels);
                 self.draws.fill(rec, first as u64, EVALUATION);
                 self.rays
                     .through(rec, views, view, first as u32, appearance_row);
                 self.forward(rec, model, now, false);
-                self.composite.normal_map(rec, &self.look(now.inv_s_lower));
+                self.composite.normal_map(rec, &self.look(now));
                 Ok(())
             })?;
             let image = gpu.download(&self.composite.image, 0, self.composite.image.len())?;

@@ -1,8 +1,9 @@
 //! Where samples lie along a ray: two rounds of proposals, then the shading samples (METHOD 2.3).
 
 use super::rays::{RayDraws, Rays};
+use super::renderer::Annealed;
 use crate::Result;
-use crate::config::Config;
+use crate::config::{Config, DensityKind};
 use crate::gpu::{Buffer, Gpu, Kernel, Recorder, Work};
 use crate::kernels::{interlevel, midpoint_positions, place_samples, resample, surface_points};
 use crate::model::{Model, ProposalBuffers, Scratch};
@@ -38,7 +39,10 @@ impl Sampler {
             place: gpu.kernel(place_samples::Shape::default())?,
             resample: gpu.kernel(resample::Shape::default())?,
             midpoints: gpu.kernel(midpoint_positions::Shape::default())?,
-            surface_points: gpu.kernel(surface_points::Shape::default())?,
+            surface_points: gpu.kernel(surface_points::Shape {
+                taps: model.surface.blocks() - 1,
+                midpoint: u32::from(config.surface.density == DensityKind::Neus),
+            })?,
             interlevel: gpu.kernel(interlevel::Shape::default())?,
             interlevel_loss,
         })
@@ -49,7 +53,7 @@ impl Sampler {
         self.levels.get(level).map_or(&self.edges, |b| &b.edges)
     }
 
-    /// Places the shading samples: `self.edges`, and into `points` the bin starts with their taps, if any. Without `train`, no jitter.
+    /// Places the shading samples: `self.edges`, and into `points` their points with the taps, if any. Without `train`, no jitter.
     #[allow(clippy::too_many_arguments)] // what a pass over the rays needs; a struct would only rename them
     pub fn place(
         &self,
@@ -57,7 +61,7 @@ impl Sampler {
         model: &Model,
         rays: &Rays,
         draws: &RayDraws,
-        anneal: f32,
+        now: Annealed,
         train: bool,
         points: &Buffer<f32>,
     ) {
@@ -115,11 +119,10 @@ impl Sampler {
                 n_samples,
                 n_new,
                 train,
-                anneal,
+                anneal: now.anneal,
             };
             rec.run(&self.resample, per_ray(2 * n_samples + n_new), args);
         }
-        let (tap_range, tap_floor) = model.surface.taps();
         let args = surface_points::Args {
             origins: rays.origins.ptr(),
             directions: rays.directions.ptr(),
@@ -129,9 +132,8 @@ impl Sampler {
             points: points.ptr_mut(),
             n,
             n_samples: self.n_samples,
-            n_blocks: model.surface.blocks(),
-            tap_range,
-            tap_floor,
+            tap_range: now.tap_step.range,
+            tap_floor: now.tap_step.floor,
         };
         rec.run(
             &self.surface_points,

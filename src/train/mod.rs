@@ -13,7 +13,7 @@ use glam::DMat4;
 use crate::Result;
 use crate::config::{AppearanceAtEval, Config};
 use crate::gpu::{Gpu, Readback, Recorder, Ticket};
-use crate::model::{Background, Model, Proposal, Scratch, Surface};
+use crate::model::{Background, Model, Proposal, Scratch, Surface, TapStep};
 use crate::render::{Annealed, Loss, LossScales, Rendered, Renderer, TERMS, TRAINING, ViewTable};
 use crate::scene::{Camera, Region, Scene, Split};
 use adam::Adam;
@@ -105,13 +105,14 @@ impl Trainer {
             gpu,
             &renderer.surface.eikonal,
             &renderer.sampler.interlevel_loss,
+            (config.loss.curvature.weight > 0.0).then_some(&renderer.surface.curvature),
             scales,
         )?;
         let s = &config.sampling;
         let mut users = vec![
             (
                 Surface::field_shape(config),
-                Surface::blocks_of(&Surface::field_shape(config)) * n_rays * s.samples,
+                Surface::blocks_of(config) * n_rays * s.samples,
             ),
             (
                 Proposal::field_shape(config, 0),
@@ -182,11 +183,11 @@ impl Trainer {
     pub fn gradients(&self, rec: &mut Recorder, now: &Now) {
         let (model, render, loss) = (&self.model, &self.renderer, &self.loss);
         let annealed = annealed(now);
-        let look = render.look(annealed.inv_s_lower);
+        let look = render.look(annealed);
         let n_samples = self.config.rays * self.config.sampling.samples;
 
         // Forward: put samples where the surface is likely, ask the fields, composite.
-        model.params.normalise_weights(rec);
+        model.refresh_weights(rec, annealed.released_levels);
         render.forward(rec, model, annealed, true);
         // Loss: its value for the log, its gradient for everything below; a few more points are asked behind the heaviest samples.
         loss.color(rec, &render.composite, &look);
@@ -201,9 +202,7 @@ impl Trainer {
             );
         }
         // Backward: the same sentence, right to left.
-        render
-            .composite
-            .backward(rec, &look, &model.surface, &loss.d_color);
+        render.composite.backward(rec, &look, model, &loss.d_color);
         if let Some(tangent) = &loss.tangent {
             tangent.run(rec, model, &look, &render.draws, &self.scratch);
         }
@@ -216,7 +215,7 @@ impl Trainer {
             &background_rays,
         );
         let eikonal_scale = self.config.loss.eikonal as f32 / n_samples as f32;
-        let shade_inputs = render.shade_inputs();
+        let shade_inputs = render.shade_inputs(annealed);
         model.surface.backward(
             rec,
             &model.params,
@@ -234,7 +233,7 @@ impl Trainer {
             &self.scratch,
             interlevel_scale,
         );
-        model.params.fold_gradients(rec);
+        model.fold_gradients(rec, annealed.released_levels);
         loss.sum(rec);
     }
 
@@ -296,7 +295,6 @@ impl Trainer {
         appearance: u32,
         keep_going: &mut dyn FnMut(f64) -> bool,
     ) -> Result<Rendered> {
-        let now = annealed(&self.schedule.at(self.step));
         self.renderer.view(
             &self.gpu,
             &self.model,
@@ -304,9 +302,14 @@ impl Trainer {
             row,
             size,
             appearance,
-            now,
+            self.annealed(),
             keep_going,
         )
+    }
+
+    /// The annealed numbers that the model is asked with as it is now.
+    pub fn annealed(&self) -> Annealed {
+        annealed(&self.schedule.at(self.step))
     }
 
     pub fn model(&self) -> &Model {
@@ -330,5 +333,12 @@ fn annealed(now: &Now) -> Annealed {
     Annealed {
         anneal: now.anneal as f32,
         inv_s_lower: now.inv_s_lower as f32,
+        cosine_anneal: now.cosine_anneal as f32,
+        tap_step: TapStep {
+            range: now.tap_range as f32,
+            floor: now.tap_floor as f32,
+        },
+        released_levels: now.released_levels,
+        curvature_weight: now.curvature_weight as f32,
     }
 }

@@ -6,9 +6,13 @@
 //!   annealing     10x / (9x + 1), x = min(k/K, 1): exponent of the proposal weights (Barron et al. 2022)
 //!   multi-step    min(k/warmup, 1) · γ^(milestones passed)
 //!   exponential   a^(1-x) b^x, x = min(k/K, 1)
+//!   release       one level more every K steps after k₀: l = max(⌊(k − k₀)/K⌋, 1), the network sees max(first, l) levels; taps that follow
+//!                 it lie a quarter of level l's cell away, and the curvature weight is divided by the grid's growth l − 1 times
 //! A run of another length than `schedule_steps` is the same schedule, stretched: k = step · schedule_steps / steps, not rounded.
 
-use crate::config::{Config, Drop, Exponential, MultiStep, Rise, ScaleBound};
+use crate::config::{
+    Config, Drop, Exponential, HashConfig, MultiStep, Rise, ScaleBound, TapStepKind,
+};
 
 /// The schedules of a run.
 #[derive(Clone, Debug)]
@@ -35,6 +39,15 @@ pub struct Now {
     pub inv_s_lower: f64,
     /// Weight of the explicit bias correction.
     pub bias_weight: f64,
+    /// Weight of the curvature loss.
+    pub curvature_weight: f64,
+    /// Levels of the surface's hash grid that its network sees.
+    pub released_levels: u32,
+    /// Taps lie max(tap_range·u, tap_floor) away, in region units.
+    pub tap_range: f64,
+    pub tap_floor: f64,
+    /// How hard NeuS's cosine is, 0 to 1.
+    pub cosine_anneal: f64,
 }
 
 impl Now {
@@ -70,6 +83,8 @@ impl Schedule {
         let step = step.saturating_sub(self.config.first_step);
         let k = self.time(step.min(self.config.steps));
         let Config {
+            hash,
+            surface,
             sampling,
             loss,
             optimizer,
@@ -77,6 +92,21 @@ impl Schedule {
             ..
         } = &self.config;
         let bias = &loss.bias;
+        let level = match hash.release.first {
+            0 => hash.levels,
+            _ => {
+                let since = (k - hash.release.start as f64).max(0.0);
+                ((since / hash.release.every as f64) as u32).clamp(1, hash.levels)
+            }
+        };
+        let growth = growth(hash);
+        let (tap_range, tap_floor) = match surface.tap_step {
+            TapStepKind::Random => (surface.tap_range, 0.25 / f64::from(hash.max)),
+            TapStepKind::Level => {
+                let cells = f64::from(hash.base) * growth.powi(level as i32 - 1);
+                (0.0, 0.25 * 2.0 / cells)
+            }
+        };
         Now {
             step,
             lr_fields: multi_step(&optimizer.fields, k),
@@ -86,8 +116,29 @@ impl Schedule {
             anneal: anneal(k / sampling.anneal_steps as f64),
             inv_s_lower: scale_bound(&loss.scale_bound, k),
             bias_weight: logarithmic(bias.weight_start, bias.weight, bias.ramp_steps, k),
+            curvature_weight: loss.curvature.weight * ramp(k, loss.curvature.warmup)
+                / growth.powi(level as i32 - 1),
+            released_levels: level.max(hash.release.first).min(hash.levels),
+            tap_range,
+            tap_floor,
+            cosine_anneal: ramp(k, surface.cosine_steps),
         }
     }
+}
+
+/// From 0 to 1 within `steps`, linearly.
+fn ramp(k: f64, steps: u64) -> f64 {
+    if k < steps as f64 {
+        k / steps as f64
+    } else {
+        1.0
+    }
+}
+
+/// Cells along an axis of a level of the hash grid over those of the level before.
+fn growth(hash: &HashConfig) -> f64 {
+    let steps = f64::from(hash.levels.max(2) - 1);
+    (f64::from(hash.max) / f64::from(hash.base)).powf(1.0 / steps)
 }
 
 /// From `start` to `end` within `steps`, as log₂(1 + x): fast first. Zero steps: `end` from the beginning.
@@ -120,8 +171,7 @@ fn anneal(x: f64) -> f64 {
 }
 
 fn multi_step(group: &MultiStep, k: f64) -> f64 {
-    let warmup = group.warmup as f64;
-    let rise = if k < warmup { k / warmup } else { 1.0 };
+    let rise = ramp(k, group.warmup);
     let passed = group
         .milestones
         .iter()

@@ -6,7 +6,7 @@ use super::schedule::Schedule;
 use crate::config::{AppearanceAtEval, Config};
 use crate::gpu::Gpu;
 use crate::model::Model;
-use crate::render::{Rendered, Renderer, ViewTable};
+use crate::render::{Annealed, Rendered, Renderer, ViewTable};
 use crate::scene::{Region, Scene, Split};
 use crate::{Error, Result};
 use std::path::PathBuf;
@@ -62,6 +62,11 @@ impl Trained {
             checkpoint: latest.checkpoint.path().into(),
             refused: latest.refused,
         })
+    }
+
+    /// The annealed numbers that the model is asked with.
+    pub fn annealed(&self) -> Annealed {
+        super::annealed(&Schedule::new(&self.config).at(self.step))
     }
 
     /// Everything that rendering the views of `scene` needs, on the device.
@@ -123,11 +128,7 @@ impl Viewer<'_> {
         keep_going: &mut dyn FnMut(f64) -> bool,
     ) -> Result<Rendered> {
         let Trained {
-            gpu,
-            config,
-            model,
-            step,
-            ..
+            gpu, config, model, ..
         } = self.trained;
         let code = match (config.appearance.at_eval, self.codes[view]) {
             (AppearanceAtEval::Frame, Some(own)) => own,
@@ -141,7 +142,7 @@ impl Viewer<'_> {
             view as u32,
             (camera.width, camera.height),
             code,
-            super::annealed(&Schedule::new(config).at(*step)),
+            self.trained.annealed(),
             keep_going,
         )
     }

@@ -392,7 +392,7 @@ fn six_tap_gradient() {
         .map(|&u| surface::tap_step(u, range, floor))
         .collect();
     assert_close("delta", &steps, deltas, 1e-14);
-    let taps = surface::tap_points(&npz.vectors("x"), &steps);
+    let taps = surface::tap_points(6, &npz.vectors("x"), &steps);
     assert_close(
         "tap_points",
         taps.as_flattened(),
@@ -401,7 +401,7 @@ fn six_tap_gradient() {
     );
     let tape = &mut Tape::default();
     let f = tape.parameter(taps.len(), 1, npz.values("tap_sdf").to_vec());
-    let gradient = surface::six_tap_gradient(tape, f, steps);
+    let gradient = surface::tap_gradient(tape, 6, f, steps);
     assert_close(
         "gradient",
         tape.value(gradient),

@@ -8,7 +8,11 @@ use crate::reference::{golden, sampling};
 #[test]
 fn whole_step_of_stage_1() {
     if let Some(npz) = golden::open("e2e_stage1") {
-        check_whole_step(&npz, &Stage::Taps, ("bias", "loss_back_pts_negative_loss"));
+        check_whole_step(
+            &npz,
+            &Stage::first(),
+            ("bias", "loss_back_pts_negative_loss"),
+        );
     }
 }
 

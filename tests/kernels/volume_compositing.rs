@@ -76,31 +76,55 @@ impl Batch {
         }
     }
 
+    /// The optical depth of every bin.
+    fn depth(&self, scale: Scale) -> neurodin::gpu::Buffer<f32> {
+        let device = device();
+        let [sdf, logit, edges, near_far, ..] = &self.arrays;
+        let count = self.n * self.n_samples;
+        let depth = device.room("optical depth", count);
+        device.run(
+            kernels::optical_depth::Shape::default(),
+            count,
+            kernels::optical_depth::Args {
+                sdf: sdf.ptr(),
+                gradient: sdf.ptr(),
+                scale: logit.ptr(),
+                directions: sdf.ptr(),
+                edges: edges.ptr(),
+                near_far: near_far.ptr(),
+                ray_outside: self.outside.ptr(),
+                optical_depth: depth.ptr_mut(),
+                n_rays: self.n as u32,
+                n_samples: self.n_samples as u32,
+                scale_range: scale.range as f32,
+                scale_floor: scale.floor as f32,
+                inv_s_lower: scale.inv_s_lower as f32,
+                anneal: 1.0,
+                outside_empty: 1,
+            },
+        );
+        depth
+    }
+
     /// (weights, image)
     pub fn forward(&self, scale: Scale) -> (Vec<f64>, Vec<f64>) {
         let device = device();
-        let [sdf, logit, edges, near_far, rgb, background] = &self.arrays;
+        let [_, _, edges, near_far, rgb, background] = &self.arrays;
         let weights = device.room("weights", self.n * self.n_samples);
         let image = device.room("image", 6 * self.n);
         device.run(
             kernels::composite_forward::Shape::default(),
             self.n,
             kernels::composite_forward::Args {
-                sdf: sdf.ptr(),
-                logit: logit.ptr(),
+                optical_depth: self.depth(scale).ptr(),
                 edges: edges.ptr(),
                 near_far: near_far.ptr(),
-                ray_outside: self.outside.ptr(),
                 rgb: rgb.ptr(),
                 background: background.ptr(),
                 weights: weights.ptr_mut(),
                 image: image.ptr_mut(),
                 n: self.n as u32,
                 n_samples: self.n_samples as u32,
-                scale_range: scale.range as f32,
-                scale_floor: scale.floor as f32,
-                inv_s_lower: scale.inv_s_lower as f32,
-                outside_empty: 1,
             },
         );
         (device.take(&weights), device.take(&image))
@@ -116,23 +140,37 @@ impl Batch {
             kernels::composite_backward::Shape::default(),
             self.n,
             kernels::composite_backward::Args {
-                sdf: sdf.ptr(),
-                logit: logit.ptr(),
-                edges: edges.ptr(),
-                near_far: near_far.ptr(),
-                ray_outside: self.outside.ptr(),
+                optical_depth: self.depth(scale).ptr(),
                 rgb: rgb.ptr(),
                 background: background.ptr(),
                 d_color: device.put("d_color", d_color).ptr(),
-                d_sdf: d[0].ptr_mut(),
-                d_logit: d[1].ptr_mut(),
+                d_optical_depth: d[0].ptr_mut(),
                 d_rgb: d[2].ptr_mut(),
                 d_background: d[3].ptr_mut(),
                 n: self.n as u32,
                 n_samples: self.n_samples as u32,
+            },
+        );
+        device.run(
+            kernels::optical_depth_backward::Shape::default(),
+            count,
+            kernels::optical_depth_backward::Args {
+                sdf: sdf.ptr(),
+                gradient: sdf.ptr(),
+                scale: logit.ptr(),
+                directions: sdf.ptr(),
+                edges: edges.ptr(),
+                near_far: near_far.ptr(),
+                ray_outside: self.outside.ptr(),
+                d_sdf: d[0].ptr_mut(),
+                d_scale: d[1].ptr_mut(),
+                d_gradient: d[2].ptr_mut(), // not written: nobody hears it
+                n_rays: self.n as u32,
+                n_samples: self.n_samples as u32,
                 scale_range: scale.range as f32,
                 scale_floor: scale.floor as f32,
                 inv_s_lower: scale.inv_s_lower as f32,
+                anneal: 1.0,
                 outside_empty: 1,
             },
         );

@@ -148,10 +148,22 @@ fn sample_points() {
     assert_close("midpoints", &device.take(&points), &planar(&want), 5e-6);
 
     let (tap_range, tap_floor) = (0.1f32, 1.0f32 / 4096.0);
-    for n_blocks in [1, 7] {
-        let points = device.room("points", 3 * n_blocks * count);
+    let around = |taps: usize, tap: usize| -> [f64; 3] {
+        if taps == 4 {
+            let k = [[1, -1, -1], [-1, -1, 1], [-1, 1, -1], [1, 1, 1]][tap];
+            return k.map(|k| f64::from(k) / 3.0_f64.sqrt());
+        }
+        let mut axis = [0.0; 3];
+        axis[tap / 2] = if tap.is_multiple_of(2) { 1.0 } else { -1.0 };
+        axis
+    };
+    for (taps, midpoint) in [(0, 0), (0, 1), (4, 1), (6, 0)] {
+        let points = device.room("points", 3 * (1 + taps) * count);
         device.run(
-            kernels::surface_points::Shape::default(),
+            kernels::surface_points::Shape {
+                taps: taps as u32,
+                midpoint,
+            },
             count,
             kernels::surface_points::Args {
                 origins: device.put("origins", &planar(&origins)).ptr(),
@@ -162,19 +174,24 @@ fn sample_points() {
                 points: points.ptr_mut(),
                 n: n as u32,
                 n_samples: n_samples as u32,
-                n_blocks: n_blocks as u32,
                 tap_range,
                 tap_floor,
             },
         );
-        let mut want: Vec<[f64; 3]> = samples().map(|(ray, i)| at(ray, t(ray, i))).collect();
-        for block in 1..n_blocks {
-            for i in 0..count {
-                let delta = (f64::from(tap_range) * draws[i]).max(f64::from(tap_floor));
-                let mut point = want[i];
-                point[(block - 1) / 2] += if block % 2 == 1 { delta } else { -delta };
-                want.push(point);
-            }
+        let distance = |ray, i| match midpoint {
+            0 => t(ray, i),
+            _ => (t(ray, i) + t(ray, i + 1)) / 2.0,
+        };
+        let samples: Vec<[f64; 3]> = samples()
+            .map(|(ray, i)| at(ray, distance(ray, i)))
+            .collect();
+        let mut want = samples.clone();
+        for tap in 0..taps {
+            want.extend(samples.iter().zip(&draws).map(|(x, draw)| {
+                let delta = (f64::from(tap_range) * draw).max(f64::from(tap_floor));
+                let offset = around(taps, tap);
+                std::array::from_fn::<f64, 3, _>(|axis| x[axis] + delta * offset[axis])
+            }));
         }
         assert_close(
             "surface points",

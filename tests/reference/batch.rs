@@ -7,13 +7,58 @@ use super::sampling::{Region, Stretch};
 use super::tape::ReluEdge;
 use std::collections::BTreeMap;
 
-/// The stages are told apart by where g, the signed distance's gradient, comes from.
+/// What tells stages and methods apart: where g, the signed distance's gradient, comes from, what hides what lies behind, and the losses
+/// of their own.
 #[derive(Clone, Debug, PartialEq)]
-pub enum Stage {
+pub struct Stage {
+    /// Points around a sample from which g is had, 6 or 4; 0: analytic.
+    pub taps: usize,
+    pub density: Density,
+    pub bias: bool,
+    pub tangent: Option<Tangent>,
+}
+
+impl Stage {
     /// Stage 1: stochastic six taps; the density is that of f; the bias loss.
-    Taps,
+    pub fn first() -> Stage {
+        Stage {
+            taps: 6,
+            density: Density::Laplace,
+            bias: true,
+            tangent: None,
+        }
+    }
+
     /// Stage 2: analytic; the density is that of f/|g·d|; the tangent loss in place of the bias loss.
-    Analytic(Tangent),
+    pub fn second(tangent: Tangent) -> Stage {
+        Stage {
+            taps: 0,
+            density: Density::Sight,
+            bias: false,
+            tangent: Some(tangent),
+        }
+    }
+}
+
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Density {
+    /// Laplace density of f (VolSDF).
+    Laplace,
+    /// Laplace density of f/|g·d| (TUVR).
+    Sight,
+    /// NeuS's opacity, f in the middle of the bin.
+    Neus,
+}
+
+/// Whose the scale is.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Scale {
+    /// β = scale_range · sigmoid(v) + scale_floor, v a head of the network.
+    Local,
+    /// β = |v| + scale_floor, one v.
+    Beta,
+    /// 1/β = e^(rate v), one v.
+    Exponential { rate: f64 },
 }
 
 /// The tangent loss: how far a normal turns within a small shift in the tangent plane.
@@ -43,7 +88,7 @@ pub struct StepConfig {
     pub hidden: usize,
     /// Geometry features handed to the colour network.
     pub features: usize,
-    /// β = scale_range · sigmoid(v) + scale_floor
+    pub scale: Scale,
     pub scale_range: f64,
     pub scale_floor: f64,
     /// δ = max(tap_range · u, tap_floor)
@@ -98,6 +143,11 @@ pub struct Now {
     /// Lower bound of 1/β.
     pub inv_s_lower: f64,
     pub bias_weight: f64,
+    pub curvature_weight: f64,
+    /// Levels of the surface's grid that the network sees.
+    pub released_levels: usize,
+    /// NeuS's c̃ = −(relu(½ − ½c)(1 − a) + relu(−c) a).
+    pub cosine_anneal: f64,
     /// Factor of the sum over rays in the colour loss: 1/N, or 1/Σ of the rays' weights.
     pub inv_count: f64,
 }
@@ -112,7 +162,7 @@ pub struct Step {
     pub now: Now,
     /// Normalised edges `[N, bins + 1]` of both proposal levels and the final one, to be taken as they are.
     pub edges: Option<[Vec<f64>; 3]>,
-    /// The surface's points, `[7 · N · S]` or in stage 2 `[2 · N · S]`, likewise: rounded to float32, a point moves by a ten-thousandth of a fine cell.
+    /// The surface's points, those of the samples and their taps, `[7 · N · S]`, or with a tangent loss of the samples and its own, `[2 · N · S]`, likewise: rounded to float32, a point moves by a ten-thousandth of a fine cell.
     pub points: Option<Vec<[f64; 3]>>,
     pub stage: Stage,
     pub relu_edge: ReluEdge,
@@ -185,7 +235,7 @@ pub struct ActivationGradients {
 
 #[derive(Clone, Debug)]
 pub struct Outcome {
-    /// "color", "eikonal", "bias" or in stage 2 "tangent", "interlevel", each with its weight, and their sum "total".
+    /// "color", "eikonal", "interlevel", and of "bias", "tangent", "curvature" those that there are, each with its weight, and their sum "total".
     pub losses: BTreeMap<String, f64>,
     pub images: Images,
     pub d_images: ActivationGradients,
@@ -214,6 +264,9 @@ impl StepConfig {
             };
             normed(format!("color.{layer}"), outputs, inputs);
             inputs = outputs;
+        }
+        if self.scale != Scale::Local {
+            plain("surface.scale".into(), 1, 1);
         }
         plain(
             "surface.table".into(),

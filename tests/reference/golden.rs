@@ -1,7 +1,7 @@
 //! The golden vectors (arrays computed with the authors' own code): where they are, and their whole training step as a [`Step`].
 
 use super::background::Background;
-use super::batch::{Draws, Now, Rays, Stage, Step, StepConfig, Tangent};
+use super::batch::{Draws, Now, Rays, Scale, Stage, Step, StepConfig, Tangent};
 use super::hash_grid::Grid;
 use super::losses::BiasReduction;
 use super::npz::Npz;
@@ -96,6 +96,7 @@ pub fn whole_step(npz: &Npz) -> Step {
         grid,
         hidden: hidden.shape[0],
         features: small("field_geometry_net_glin1_bias").values.len() - 2,
+        scale: Scale::Local,
         scale_range: 0.1,
         scale_floor: 2e-4,
         tap_range: 0.1,
@@ -127,6 +128,9 @@ pub fn whole_step(npz: &Npz) -> Step {
         anneal: npz.scalar("anneal"),
         inv_s_lower: 1.0 / npz.scalar("schedule_beta"),
         bias_weight: 0.1,
+        curvature_weight: 0.0,
+        released_levels: config.grid.levels.len(),
+        cosine_anneal: 1.0,
         inv_count: 1.0 / origins.len() as f64,
     };
     let rays = Rays {
@@ -156,14 +160,14 @@ pub fn whole_step(npz: &Npz) -> Step {
         now,
         edges: None,
         points: None,
-        stage: Stage::Taps,
+        stage: Stage::first(),
         relu_edge: ReluEdge::default(),
     }
 }
 
 /// Stage 2 of the archive `e2e_stage2`.
 pub fn second_stage(npz: &Npz) -> Stage {
-    Stage::Analytic(Tangent {
+    Stage::second(Tangent {
         weight: 0.005,
         step: 0.01,
         draws: npz.vectors("draw3_randn"),

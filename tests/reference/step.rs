@@ -1,7 +1,7 @@
 //! One training step, whole: rays in; losses, images and the gradient of every parameter out.
 
 use super::background::{Background, Field};
-use super::batch::{ActivationGradients, Images, Outcome, Stage, Step, Tangent};
+use super::batch::{ActivationGradients, Density, Images, Outcome, Scale, Step, Tangent};
 use super::losses;
 use super::networks::{NormedLayer, sigmoid};
 use super::proposal::{self, Proposal};
@@ -47,24 +47,17 @@ struct ProposalLevel {
     weights: Var,
 }
 
-/// The surface field at the bins' starts.
+/// The surface field at the samples: the bins' starts, or with NeuS's opacity their middles.
 struct Shading {
     points: Vec<[f64; 3]>,
-    /// At every point that was asked: starts and taps.
+    /// At every point that was asked: samples and taps.
     sdf_all: Var,
     sdf: Var,
     logit: Var,
     features: Var,
     gradient: Var,
-}
-
-/// The loss that a stage has of its own, and what it asks the field for.
-struct StageLoss {
-    name: &'static str,
-    loss: Var,
-    bias_sdf: Option<Var>,
-    tangent_points: Option<Var>,
-    tangent_gradient: Option<Var>,
+    /// Distance of the taps, if there are any.
+    tap_steps: Vec<f64>,
 }
 
 impl Step {
@@ -89,31 +82,50 @@ impl Step {
             table: spans.get("surface.table"),
             hidden: spans.normed("surface.hidden"),
             heads: spans.normed("surface.heads"),
+            released: now.released_levels,
         };
-        let shading = self.shade(tape, field, stage, &mut images);
+        let shading = self.shade(tape, field, &mut images);
         let gradient = shading.gradient;
 
         // Density, weights, colours, image.
-        let inv_s = volume::inverse_scale(
-            tape,
-            shading.logit,
-            config.scale_range,
-            config.scale_floor,
-            now.inv_s_lower,
-        );
-        let beta = volume::reciprocal(tape, inv_s);
-        let sdf = self.empty_outside(tape, shading.sdf, &images.stretches);
-        let directions = self.sample_directions();
-        let distance = match stage {
-            Stage::Taps => sdf,
-            Stage::Analytic(_) => {
-                let directions = tape.points(&directions);
-                volume::distance_along_ray(tape, sdf, gradient, directions)
+        let count = n * samples;
+        let inv_s = match config.scale {
+            Scale::Local => volume::inverse_scale(
+                tape,
+                shading.logit,
+                config.scale_range,
+                config.scale_floor,
+                now.inv_s_lower,
+            ),
+            shared => {
+                let v = tape.gather_rows(spans.get("surface.scale"), vec![0; count]);
+                volume::shared_inverse_scale(tape, v, shared, config.scale_floor)
             }
         };
-        let density = volume::laplace_density(tape, distance, beta);
-        let density = tape.reshape(density, n, samples);
+        let sdf = self.empty_outside(tape, shading.sdf, &images.stretches);
+        let directions = self.sample_directions();
         let lengths = per_ray(&images.distances[2], n, sampling::lengths);
+        // σ over the bins' lengths, or τ over lengths of 1.
+        let (density, lengths) = match stage.density {
+            Density::Neus => {
+                let parts = [sdf, gradient, inv_s];
+                let depth =
+                    volume::neus_depth(tape, parts, &directions, lengths, now.cosine_anneal);
+                (depth, vec![1.0; count])
+            }
+            Density::Laplace | Density::Sight => {
+                let distance = match stage.density {
+                    Density::Laplace => sdf,
+                    _ => {
+                        let directions = tape.points(&directions);
+                        volume::distance_along_ray(tape, sdf, gradient, directions)
+                    }
+                };
+                let beta = volume::reciprocal(tape, inv_s);
+                (volume::laplace_density(tape, distance, beta), lengths)
+            }
+        };
+        let density = tape.reshape(density, n, samples);
         let weights = volume::ray_weights(tape, density, lengths);
         let rgb = self.sample_colors(tape, &spans, &shading, &directions);
         let padded = volume::pad_color(tape, rgb);
@@ -127,19 +139,30 @@ impl Step {
         let color = tape.scale(color, now.inv_count);
         let eikonal = losses::eikonal(tape, gradient);
         let eikonal = tape.scale(eikonal, config.eikonal_weight);
-        let own = match stage {
-            Stage::Taps => self.bias_loss(tape, field, sdf, &mut images),
-            Stage::Analytic(tangent) => {
-                self.tangent_loss(tape, field, gradient, tangent, &mut images)
-            }
-        };
         let interlevel = self.interlevel_loss(tape, &proposals, &images);
-        let named = [
+        let mut named = vec![
             ("color", color),
             ("eikonal", eikonal),
-            (own.name, own.loss),
             ("interlevel", interlevel),
         ];
+        let mut bias_sdf = None;
+        if stage.bias {
+            let (loss, sdf) = self.bias_loss(tape, field, sdf, &mut images);
+            named.push(("bias", loss));
+            bias_sdf = Some(sdf);
+        }
+        let (mut tangent_points, mut tangent_gradient) = (None, None);
+        if let Some(tangent) = &stage.tangent {
+            let (loss, points, at_points) =
+                self.tangent_loss(tape, field, gradient, tangent, &mut images);
+            named.push(("tangent", loss));
+            (tangent_points, tangent_gradient) = (Some(points), Some(at_points));
+        }
+        if now.curvature_weight > 0.0 {
+            let steps = shading.tap_steps.clone();
+            let loss = surface::curvature(tape, stage.taps, shading.sdf_all, steps);
+            named.push(("curvature", tape.scale(loss, now.curvature_weight)));
+        }
         let total = named[1..]
             .iter()
             .fold(color, |sum, &(_, loss)| tape.add(sum, loss));
@@ -170,9 +193,9 @@ impl Step {
             features: gradients.get(shading.features),
             rgb: gradients.get(rgb),
             background: gradients.get(background),
-            bias_sdf: of_one(own.bias_sdf),
-            tangent_points: of_one(own.tangent_points),
-            tangent_gradient: of_one(own.tangent_gradient),
+            bias_sdf: of_one(bias_sdf),
+            tangent_points: of_one(tangent_points),
+            tangent_gradient: of_one(tangent_gradient),
         };
         Outcome {
             losses,
@@ -244,49 +267,52 @@ impl Step {
         proposals
     }
 
-    /// The surface field at bin starts, and g there: from six taps around them, or analytically.
-    fn shade(
-        &self,
-        tape: &mut Tape,
-        field: Surface,
-        stage: &Stage,
-        images: &mut Images,
-    ) -> Shading {
+    /// The surface field at the samples, and g there: from taps around them, or analytically.
+    fn shade(&self, tape: &mut Tape, field: Surface, images: &mut Images) -> Shading {
         let (config, n) = (&self.config, self.rays.origins.len());
         let count = n * config.samples;
-        let points = self.points_at(
-            config.samples,
-            &per_ray(&images.distances[2], n, |t| t[..t.len() - 1].to_vec()),
-        );
-        let (heads, sdf_all, gradient) = match stage {
-            Stage::Taps => {
-                let step = |&draw| surface::tap_step(draw, config.tap_range, config.tap_floor);
-                let steps: Vec<f64> = self.draws.taps.iter().map(step).collect();
-                assert_eq!(steps.len(), count, "one tap draw per shading sample");
-                let own = || [points.clone(), surface::tap_points(&points, &steps)].concat();
-                images.points = self.points.clone().unwrap_or_else(own);
-                let heads = field.heads(tape, &config.grid, &images.points);
-                let sdf_all = tape.columns(heads, 0..1);
-                let taps = tape.rows(sdf_all, count..7 * count);
-                let gradient = surface::six_tap_gradient(tape, taps, steps);
-                (heads, sdf_all, gradient)
-            }
-            Stage::Analytic(_) => {
+        let distances = match self.stage.density {
+            Density::Neus => per_ray(&images.distances[2], n, sampling::midpoints),
+            _ => per_ray(&images.distances[2], n, |t| t[..t.len() - 1].to_vec()),
+        };
+        let points = self.points_at(config.samples, &distances);
+        let mut tap_steps = Vec::new();
+        let (heads, sdf_all, gradient) = match self.stage.taps {
+            0 => {
                 let given = self.points.as_deref().map(|given| &given[..count]);
                 images.points = given.unwrap_or(&points).to_vec();
                 let x = tape.points(&images.points);
                 let (heads, gradient) = field.heads_and_gradient(tape, &config.grid, x);
                 (heads, tape.columns(heads, 0..1), gradient)
             }
+            taps => {
+                let step = |&draw| surface::tap_step(draw, config.tap_range, config.tap_floor);
+                tap_steps = self.draws.taps.iter().map(step).collect();
+                assert_eq!(tap_steps.len(), count, "one tap draw per shading sample");
+                let own = || {
+                    [
+                        points.clone(),
+                        surface::tap_points(taps, &points, &tap_steps),
+                    ]
+                    .concat()
+                };
+                images.points = self.points.clone().unwrap_or_else(own);
+                let heads = field.heads(tape, &config.grid, &images.points);
+                let sdf_all = tape.columns(heads, 0..1);
+                let at_taps = tape.rows(sdf_all, count..(1 + taps) * count);
+                let gradient = surface::tap_gradient(tape, taps, at_taps, tap_steps.clone());
+                (heads, sdf_all, gradient)
+            }
         };
-        let at_starts = tape.rows(heads, 0..count);
+        let at_samples = tape.rows(heads, 0..count);
         Shading {
             points,
             sdf_all,
             sdf: tape.rows(sdf_all, 0..count),
-            logit: tape.columns(at_starts, 1..2),
-            features: tape.columns(at_starts, 2..2 + config.features),
+            logit: tape.columns(at_samples, 1..2),
+            features: tape.columns(at_samples, 2..2 + config.features),
             gradient,
+            tap_steps,
         }
     }
 
@@ -311,14 +337,14 @@ impl Step {
         }
     }
 
-    /// `sdf`: with the rays outside emptied.
+    /// The loss, and the signed distances that it asks for. `sdf`: with the rays outside emptied.
     fn bias_loss(
         &self,
         tape: &mut Tape,
         field: Surface,
         sdf: Var,
         images: &mut Images,
-    ) -> StageLoss {
+    ) -> (Var, Var) {
         let (config, rays) = (&self.config, &self.rays);
         let (n, samples) = (rays.origins.len(), config.samples);
         let midpoints = per_ray(&images.distances[2], n, sampling::midpoints);
@@ -355,16 +381,10 @@ impl Step {
             config.bias_epsilon,
             config.bias_reduction,
         );
-        StageLoss {
-            name: "bias",
-            loss: tape.scale(loss, self.now.bias_weight),
-            bias_sdf: Some(bias_sdf),
-            tangent_points: None,
-            tangent_gradient: None,
-        }
+        (tape.scale(loss, self.now.bias_weight), bias_sdf)
     }
 
-    /// Over all samples, those of rays outside included. The shifts start at the bins' middles, though the normals are those of the
+    /// The loss, its points, and g there. Over all samples, those of rays outside included. The shifts start at the bins' middles, though the normals are those of the
     /// starts; the shifted points, and g there, keep their derivatives by those normals.
     fn tangent_loss(
         &self,
@@ -373,7 +393,7 @@ impl Step {
         gradient: Var,
         tangent: &Tangent,
         images: &mut Images,
-    ) -> StageLoss {
+    ) -> (Var, Var, Var) {
         let (n, samples) = (self.rays.origins.len(), self.config.samples);
         let count = n * samples;
         assert_eq!(tangent.draws.len(), count, "one draw per shading sample");
@@ -393,13 +413,7 @@ impl Step {
         images.tangent_gradient = tape.value(shifted).to_vec();
         let shifted_normals = surface::normals(tape, shifted);
         let loss = losses::tangent(tape, normals, shifted_normals);
-        StageLoss {
-            name: "tangent",
-            loss: tape.scale(loss, tangent.weight),
-            bias_sdf: None,
-            tangent_points: Some(points),
-            tangent_gradient: Some(shifted),
-        }
+        (tape.scale(loss, tangent.weight), points, shifted)
     }
 
     fn interlevel_loss(

@@ -1,4 +1,4 @@
-//! The surface field: signed distance, scale logit and geometry features of a point; the distance's gradient, by stochastic six taps or
+//! The surface field: signed distance, scale logit and geometry features of a point; the distance's gradient, by taps or
 //! analytically; points shifted in the tangent plane; the colour seen there.
 
 use super::hash_grid::{Grid, encode, encoding_slope};
@@ -16,6 +16,8 @@ pub struct Surface {
     pub hidden: NormedLayer,
     /// Rows: signed distance, scale logit, geometry features.
     pub heads: NormedLayer,
+    /// Levels of the grid whose features the network sees; zeros stand for the others.
+    pub released: usize,
 }
 
 impl Surface {
@@ -24,8 +26,17 @@ impl Surface {
         let x = tape.points(points);
         let u = unit_cube(tape, x);
         let encoding = encode(tape, grid, self.table, u);
+        let encoding = self.released(tape, grid, encoding);
         let input = tape.concat(&[x, encoding]);
         geometry_network(tape, self.hidden, self.heads, input)
+    }
+
+    /// The columns of an encoding, or of a gradient by it, that the network sees, and zeros.
+    fn released(self, tape: &mut Tape, grid: &Grid, encoding: Var) -> Var {
+        let seen = tape.columns(encoding, 0..self.released * grid.features);
+        let unseen = grid.width() - seen.cols;
+        let zeros = tape.constant(encoding.rows, unseen, vec![0.0; encoding.rows * unseen]);
+        tape.concat(&[seen, zeros])
     }
 
     pub fn sdf(self, tape: &mut Tape, grid: &Grid, points: &[[f64; 3]]) -> Var {
@@ -38,10 +49,12 @@ impl Surface {
     pub fn heads_and_gradient(self, tape: &mut Tape, grid: &Grid, x: Var) -> (Var, Var) {
         let u = unit_cube(tape, x);
         let encoding = encode(tape, grid, self.table, u);
+        let encoding = self.released(tape, grid, encoding);
         let input = tape.concat(&[x, encoding]);
         let (heads, slope) = geometry_network_with_slope(tape, self.hidden, self.heads, input);
         let by_x = tape.columns(slope, 0..3);
         let by_encoding = tape.columns(slope, 3..slope.cols);
+        let by_encoding = self.released(tape, grid, by_encoding);
         let by_u = encoding_slope(tape, grid, self.table, u, by_encoding);
         let through_encoding = tape.scale(by_u, 0.5);
         (heads, tape.add(by_x, through_encoding))
@@ -53,44 +66,101 @@ pub fn tap_step(draw: f64, range: f64, floor: f64) -> f64 {
     (range * draw).max(floor)
 }
 
-/// Six blocks of the samples' points, moved by +x, −x, +y, −y, +z, −z times their own step.
-pub fn tap_points(points: &[[f64; 3]], steps: &[f64]) -> Vec<[f64; 3]> {
-    let mut taps = Vec::with_capacity(6 * points.len());
-    for axis in 0..3 {
-        for sign in [1.0, -1.0] {
-            taps.extend(points.iter().zip(steps).map(|(&x, &step)| {
-                let mut tap = x;
-                tap[axis] += sign * step;
-                tap
-            }));
+/// The four taps' corners; the taps are ε/√3 times these away.
+const CORNERS: [[f64; 3]; 4] = [
+    [1.0, -1.0, -1.0],
+    [-1.0, -1.0, 1.0],
+    [-1.0, 1.0, -1.0],
+    [1.0, 1.0, 1.0],
+];
+
+/// How far a tap is from its sample, and by what f there enters g: of six taps ±δ along an axis and ±1/(2δ), of four k ε/√3 and
+/// k/(4 ε/√3).
+fn tap(taps: usize, tap: usize, step: f64) -> ([f64; 3], [f64; 3]) {
+    match taps {
+        6 => {
+            let mut axis = [0.0; 3];
+            axis[tap / 2] = if tap.is_multiple_of(2) { 1.0 } else { -1.0 };
+            (axis.map(|a| a * step), axis.map(|a| a / (2.0 * step)))
         }
+        4 => {
+            let e = step / 3.0_f64.sqrt();
+            (
+                CORNERS[tap].map(|k| k * e),
+                CORNERS[tap].map(|k| k / (4.0 * e)),
+            )
+        }
+        _ => panic!("{taps} taps"),
     }
-    taps
 }
 
-/// g_j = (f(x + δe_j) − f(x − δe_j))/(2δ) for f `[6n, 1]` at [`tap_points`]: `[n, 3]`.
-pub fn six_tap_gradient(tape: &mut Tape, taps: Var, steps: Vec<f64>) -> Var {
+/// Blocks of the samples' points, one per tap, moved by +x, −x, +y, −y, +z, −z times their own step, or to the four corners.
+pub fn tap_points(taps: usize, points: &[[f64; 3]], steps: &[f64]) -> Vec<[f64; 3]> {
+    (0..taps)
+        .flat_map(|block| points.iter().zip(steps).map(move |sample| (block, sample)))
+        .map(|(block, (x, &step))| {
+            let (offset, _) = tap(taps, block, step);
+            std::array::from_fn(|axis| x[axis] + offset[axis])
+        })
+        .collect()
+}
+
+/// g for f `[taps · n, 1]` at [`tap_points`]: `[n, 3]`; of six taps (f(x + δe_j) − f(x − δe_j))/(2δ).
+pub fn tap_gradient(tape: &mut Tape, taps: usize, at_taps: Var, steps: Vec<f64>) -> Var {
     let n = steps.len();
-    assert_eq!(taps.len(), 6 * n);
+    assert_eq!(at_taps.len(), taps * n);
     let mut value = vec![0.0; 3 * n];
-    for (sample, step) in steps.iter().enumerate() {
-        for axis in 0..3 {
-            let f = |side: usize| tape.value(taps)[(2 * axis + side) * n + sample];
-            value[sample * 3 + axis] = (f(0) - f(1)) / (2.0 * step);
+    for (sample, &step) in steps.iter().enumerate() {
+        for block in 0..taps {
+            let f = tape.value(at_taps)[block * n + sample];
+            let (_, by_f) = tap(taps, block, step);
+            (0..3).for_each(|axis| value[sample * 3 + axis] += by_f[axis] * f);
         }
     }
-    tape.record(n, 3, value, &[taps], move |_, d_gradient, gradients| {
-        let Some(d_taps) = gradients.of(taps) else {
+    tape.record(n, 3, value, &[at_taps], move |_, d_gradient, gradients| {
+        let Some(d_taps) = gradients.of(at_taps) else {
             return;
         };
-        for (sample, step) in steps.iter().enumerate() {
-            for axis in 0..3 {
-                let d = d_gradient[sample * 3 + axis] / (2.0 * step);
-                d_taps[2 * axis * n + sample] += d;
-                d_taps[(2 * axis + 1) * n + sample] -= d;
+        for (sample, &step) in steps.iter().enumerate() {
+            for block in 0..taps {
+                let (_, by_f) = tap(taps, block, step);
+                for axis in 0..3 {
+                    d_taps[block * n + sample] += by_f[axis] * d_gradient[sample * 3 + axis];
+                }
             }
         }
     })
+}
+
+/// Mean |Σ_j ∂²f/∂x_j²| for f `[(1 + taps) · n, 1]` at samples and taps: of six taps Σ (f(x + δe_j) − 2f(x) + f(x − δe_j))/δ², of four
+/// (½ Σ f − 2f(x))/(ε²/3).
+pub fn curvature(tape: &mut Tape, taps: usize, sdf: Var, steps: Vec<f64>) -> Var {
+    let n = steps.len();
+    assert_eq!(sdf.len(), (1 + taps) * n);
+    let by_square = if taps == 6 { 1.0 } else { 1.5 };
+    let trace = move |tape: &Tape, sample: usize, step: f64| -> f64 {
+        let f = |block: usize| tape.value(sdf)[block * n + sample];
+        let around: f64 = (1..=taps).map(f).sum();
+        by_square * (around - taps as f64 * f(0)) / (step * step)
+    };
+    let sum: f64 = (0..n).map(|i| trace(tape, i, steps[i]).abs()).sum();
+    tape.record(
+        1,
+        1,
+        vec![sum / n as f64],
+        &[sdf],
+        move |tape, d, gradients| {
+            let Some(d_sdf) = gradients.of(sdf) else {
+                return;
+            };
+            for (sample, &step) in steps.iter().enumerate() {
+                let side = trace(tape, sample, step).signum();
+                let d_f = d[0] * side * by_square / (step * step * n as f64);
+                d_sdf[sample] -= taps as f64 * d_f;
+                (1..=taps).for_each(|block| d_sdf[block * n + sample] += d_f);
+            }
+        },
+    )
 }
 
 /// g/max(‖g‖, 1e-12)

@@ -1,7 +1,7 @@
 //! Small steps to test with: a configuration, parameters near the geometric initialisation, and rays, all drawn from a seed.
 
 use super::background::{Background, FieldConfig};
-use super::batch::{Draws, Now, Rays, Stage, Step, StepConfig, Tangent};
+use super::batch::{Draws, Now, Rays, Scale, Stage, Step, StepConfig, Tangent};
 use super::hash_grid::Grid;
 use super::losses::BiasReduction;
 use super::sampling::Region;
@@ -57,6 +57,7 @@ pub fn config() -> StepConfig {
         grid: Grid::published(4, 4, 32, 10, 2),
         hidden: 16,
         features: 7,
+        scale: Scale::Local,
         scale_range: 0.1,
         scale_floor: 2e-4,
         tap_range: 0.1,
@@ -120,6 +121,11 @@ pub fn parameters(
             "surface.heads.bias" => (0..cols)
                 .map(|_| -0.5 * side + random.symmetric(0.02))
                 .collect(),
+            // 1/β of about 30.
+            "surface.scale" => match config.scale {
+                Scale::Exponential { rate } => vec![3.4 / rate],
+                _ => vec![0.03],
+            },
             _ if name.ends_with("table") => {
                 (0..rows * cols).map(|_| random.symmetric(0.3)).collect()
             }
@@ -192,6 +198,9 @@ pub fn step(config: StepConfig, n: usize, seed: u64) -> Step {
         anneal: 0.8,
         inv_s_lower: 0.01,
         bias_weight: 0.1,
+        curvature_weight: 0.0,
+        released_levels: config.grid.levels.len(),
+        cosine_anneal: 1.0,
         inv_count: 1.0 / n as f64,
     };
     Step {
@@ -202,7 +211,7 @@ pub fn step(config: StepConfig, n: usize, seed: u64) -> Step {
         now,
         edges: None,
         points: None,
-        stage: Stage::Taps,
+        stage: Stage::first(),
         relu_edge: ReluEdge::default(),
     }
 }
@@ -211,7 +220,7 @@ pub fn step(config: StepConfig, n: usize, seed: u64) -> Step {
 pub fn second_stage(step: &Step, seed: u64) -> Stage {
     let random = &mut Random(seed);
     let samples = step.rays.origins.len() * step.config.samples;
-    Stage::Analytic(Tangent {
+    Stage::second(Tangent {
         weight: 0.005,
         step: 0.01,
         draws: (0..samples)

@@ -1,5 +1,6 @@
-//! From signed distances to colours: local scale, Laplace density, quadrature along the ray, compositing.
+//! From signed distances to colours: scale, Laplace density or NeuS's opacity, quadrature along the ray, compositing.
 
+use super::batch::Scale;
 use super::networks::logistic;
 use super::tape::{Tape, Var};
 
@@ -15,6 +16,84 @@ pub fn inverse_scale(tape: &mut Tape, logit: Var, range: f64, floor: f64, lower:
                 0.0
             } else {
                 -inverse * inverse * range * sigmoid * (1.0 - sigmoid)
+            }
+        },
+    )
+}
+
+/// 1/β of one v for all, |v| + floor or e^(rate v); nothing bounds it from below.
+pub fn shared_inverse_scale(tape: &mut Tape, v: Var, scale: Scale, floor: f64) -> Var {
+    match scale {
+        Scale::Local => panic!("every sample has its own"),
+        Scale::Beta => tape.map(
+            v,
+            move |v| 1.0 / (v.abs() + floor),
+            move |v, y| -y * y * v.signum(),
+        ),
+        Scale::Exponential { rate } => tape.map(v, move |v| (rate * v).exp(), move |_, y| rate * y),
+    }
+}
+
+/// NeuS: τ = −ln(1 − α), α = (Φ(s(f − ½c̃δ)) − Φ(s(f + ½c̃δ)))/(Φ(s(f − ½c̃δ)) + 1e-5), c̃ = −(relu(½ − ½c)(1 − a) + relu(−c) a), c = g·d,
+/// for bin lengths δ and scales s, all `[n]`, directions `[n, 3]`.
+pub fn neus_depth(
+    tape: &mut Tape,
+    [sdf, gradient, inv_s]: [Var; 3],
+    directions: &[[f64; 3]],
+    lengths: Vec<f64>,
+    anneal: f64,
+) -> Var {
+    const EPSILON: f64 = 1e-5;
+    let n = sdf.len();
+    assert_eq!([gradient.rows, inv_s.len(), lengths.len()], [n; 3]);
+    let directions = directions.to_vec();
+    // c, c̃, and Φ at both ends.
+    let at = move |tape: &Tape, i: usize, direction: [f64; 3], length: f64| {
+        let g = tape.point(gradient, i);
+        let c: f64 = g.iter().zip(direction).map(|(g, d)| g * d).sum::<f64>() + 1e-8;
+        let facing = (0.5 - 0.5 * c).max(0.0) * (1.0 - anneal) + (-c).max(0.0) * anneal;
+        let (f, s) = (tape.value(sdf)[i], tape.value(inv_s)[i]);
+        let ends = [0.5, -0.5].map(|side| f + side * facing * length);
+        (c, ends, ends.map(|x| logistic(s * x)))
+    };
+    let value = (0..n)
+        .map(|i| {
+            let (_, _, [before, after]) = at(tape, i, directions[i], lengths[i]);
+            -(1.0 - (before - after) / (before + EPSILON)).ln()
+        })
+        .collect();
+    tape.record(
+        sdf.rows,
+        sdf.cols,
+        value,
+        &[sdf, gradient, inv_s],
+        move |tape, d_tau, gradients| {
+            for i in 0..n {
+                let (c, ends, phi) = at(tape, i, directions[i], lengths[i]);
+                let [before, after] = phi;
+                let alpha = (before - after) / (before + EPSILON);
+                let d_alpha = d_tau[i] / (1.0 - alpha);
+                let d_phi = [
+                    d_alpha * (after + EPSILON) / (before + EPSILON).powi(2),
+                    -d_alpha / (before + EPSILON),
+                ];
+                let s = tape.value(inv_s)[i];
+                let d_end = [0, 1].map(|end| d_phi[end] * phi[end] * (1.0 - phi[end]));
+                if let Some(d_sdf) = gradients.of(sdf) {
+                    d_sdf[i] += s * (d_end[0] + d_end[1]);
+                }
+                if let Some(d_s) = gradients.of(inv_s) {
+                    d_s[i] += ends[0] * d_end[0] + ends[1] * d_end[1];
+                }
+                if let Some(d_gradient) = gradients.of(gradient) {
+                    let d_facing = 0.5 * lengths[i] * s * (d_end[0] - d_end[1]);
+                    let soft = if c < 1.0 { -0.5 } else { 0.0 };
+                    let hard = if c < 0.0 { -1.0 } else { 0.0 };
+                    let d_c = d_facing * (soft * (1.0 - anneal) + hard * anneal);
+                    for axis in 0..3 {
+                        d_gradient[i * 3 + axis] += d_c * directions[i][axis];
+                    }
+                }
             }
         },
     )

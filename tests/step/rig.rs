@@ -1,13 +1,15 @@
 //! A trainer on the device beside the twin of its configuration, and the way of numbers between the two.
 
 use crate::reference::background::{Background, FieldConfig};
-use crate::reference::batch::{Draws, Rays, Stage, Step, StepConfig, Tangent};
+use crate::reference::batch::{Density, Draws, Rays, Scale, Stage, Step, StepConfig, Tangent};
 use crate::reference::hash_grid::{Grid, Level};
 use crate::reference::losses;
 use crate::reference::sampling::{self, Stretch};
 use crate::reference::tape::ReluEdge;
 use neurodin::Result;
-use neurodin::config::{BackgroundKind, BiasReduction, Config, GradientKind};
+use neurodin::config::{
+    BackgroundKind, BiasReduction, Config, DensityKind, GradientKind, ScaleKind,
+};
 use neurodin::gpu::{Buffer, Gpu, GpuOptions};
 use neurodin::model::HashGrid;
 use neurodin::scene::synthetic::{CENTER, RADIUS, SyntheticOptions};
@@ -203,14 +205,21 @@ impl Rig {
         let (n, samples) = (self.n_rays(), self.n_rays() * self.twin.samples);
         let (jitter, rest) = all[3 * n..].split_at(3 * n);
         let jitter = |level: usize| jitter[level * n..(level + 1) * n].to_vec();
-        let blocks = match self.config.surface.gradient {
-            GradientKind::Taps => 1,
-            GradientKind::Analytic => 2,
+        let surface = &self.config.surface;
+        let (taps, blocks) = match surface.gradient {
+            GradientKind::Taps => (surface.taps as usize, 1),
+            GradientKind::Analytic => (0, 2),
         };
         let (of_samples, background) = rest.split_at(blocks * samples);
-        let stage = match self.config.surface.gradient {
-            GradientKind::Taps => Stage::Taps,
-            GradientKind::Analytic => Stage::Analytic(Tangent {
+        let stage = Stage {
+            taps,
+            density: match surface.density {
+                DensityKind::Laplace => Density::Laplace,
+                DensityKind::Sight => Density::Sight,
+                DensityKind::Neus => Density::Neus,
+            },
+            bias: self.config.loss.bias.weight > 0.0,
+            tangent: (self.config.loss.tangent > 0.0).then(|| Tangent {
                 weight: self.config.loss.tangent,
                 step: 0.01,
                 draws: (0..samples)
@@ -229,11 +238,9 @@ impl Rig {
     pub fn upload_draws(&self, draws: &Draws, stage: &Stage) -> Result<(Draws, Stage)> {
         let pixels = vec![0.5; 3 * self.n_rays()];
         let [first, second, third] = &draws.jitter;
-        let of_samples = match stage {
-            Stage::Taps => draws.taps.clone(),
-            Stage::Analytic(tangent) => {
-                planar(&tangent.draws.iter().map(uniforms).collect::<Vec<_>>())
-            }
+        let of_samples = match &stage.tangent {
+            None => draws.taps.clone(),
+            Some(tangent) => planar(&tangent.draws.iter().map(uniforms).collect::<Vec<_>>()),
         };
         let all = [
             &pixels,
@@ -318,6 +325,13 @@ fn twin_config(config: &Config, shape: &RegionShape, views: u32) -> StepConfig {
         }),
         hidden: surface.hidden as usize,
         features: surface.features as usize,
+        scale: match surface.scale {
+            ScaleKind::Local => Scale::Local,
+            ScaleKind::Beta => Scale::Beta,
+            ScaleKind::Exponential => Scale::Exponential {
+                rate: surface.scale_rate,
+            },
+        },
         scale_range: surface.scale_max,
         scale_floor: surface.scale_floor,
         tap_range: surface.tap_range,

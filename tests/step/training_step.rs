@@ -1,6 +1,6 @@
 //! `Trainer::step` in the middle of a run, in several configurations, against the twin given the same rays, draws and parameters.
 
-use crate::reference::batch::{Now, Outcome, Stage, Step};
+use crate::reference::batch::{Now, Outcome, Step, StepConfig};
 use crate::reference::optimizer::Adam;
 use crate::reference::sampling;
 use crate::reference::tape::ReluEdge;
@@ -62,6 +62,44 @@ fn second_stage_indoors_with_other_features() -> Result<()> {
     config.appearance.dims = 8;
     let half = dvec3(1.0, 0.8, 0.9);
     check(config, RegionShape::Box { half }, 9, false)
+}
+
+/// Every density, scale and kind of gradient that the methods combine.
+#[test]
+fn laplace_density_of_one_beta_with_analytic_gradient() -> Result<()> {
+    check(method("volsdf-grid"), RegionShape::Sphere, 9, false)
+}
+
+#[test]
+fn sight_density_of_one_beta() -> Result<()> {
+    check(method("tuvr-grid"), RegionShape::Sphere, 9, false)
+}
+
+#[test]
+fn neus_opacity_with_analytic_gradient() -> Result<()> {
+    check(method("neus-grid"), RegionShape::Sphere, 9, false)
+}
+
+#[test]
+fn neus_opacity_with_four_taps_curvature_and_release() -> Result<()> {
+    let config = method("neuralangelo");
+    let now = Schedule::new(&config).at(STEP);
+    assert!(now.released_levels < config.hash.levels && now.curvature_weight > 0.0);
+    check(config, RegionShape::Sphere, 9, false)
+}
+
+#[test]
+fn neus_opacity_with_six_taps_curvature_and_release() -> Result<()> {
+    check(method("neuralangelo-6"), RegionShape::Sphere, 9, false)
+}
+
+#[test]
+fn bias_correction_with_analytic_gradient() -> Result<()> {
+    check(method("ablation-b"), RegionShape::Sphere, 9, false)
+}
+
+fn method(name: &str) -> Config {
+    preset("outdoor-tiny").with_method(name).expect("a method")
 }
 
 #[test]
@@ -147,12 +185,16 @@ fn check(config: Config, shape: RegionShape, seed: u64, portable: bool) -> Resul
     let rays = rig.rays()?;
     check_stretches(&rig, &rays);
     let (draws, stage) = rig.draws()?;
-    let own_loss = match stage {
-        Stage::Taps => "bias",
-        Stage::Analytic(_) => "tangent",
-    };
+    let mut named = vec!["color", "eikonal", "interlevel"];
+    named.extend(stage.bias.then_some("bias"));
+    named.extend(stage.tangent.is_some().then_some("tangent"));
+    named.extend((now.curvature_weight > 0.0).then_some("curvature"));
     let mut step = Step {
-        config: rig.twin.clone(),
+        config: StepConfig {
+            tap_range: now.tap_range,
+            tap_floor: now.tap_floor,
+            ..rig.twin.clone()
+        },
         params: params.clone(),
         draws,
         stage,
@@ -160,6 +202,9 @@ fn check(config: Config, shape: RegionShape, seed: u64, portable: bool) -> Resul
             anneal: now.anneal,
             inv_s_lower: now.inv_s_lower,
             bias_weight: now.bias_weight,
+            curvature_weight: now.curvature_weight,
+            released_levels: now.released_levels as usize,
+            cosine_anneal: now.cosine_anneal,
             inv_count: 1.0 / rig.n_rays() as f64,
         },
         rays,
@@ -191,7 +236,7 @@ fn check(config: Config, shape: RegionShape, seed: u64, portable: bool) -> Resul
     step.points = Some(rig.points()?);
     let twin = step.run();
     check_images(&rig, &twin)?;
-    check_losses(&twin, &losses, own_loss);
+    check_losses(&twin, &losses, &named);
     check_update(&rig, &GradientRange::of(&step), &params, [&m0, &v0], &now)?;
     rig.check_device()
 }
@@ -283,7 +328,7 @@ fn check_images(rig: &Rig, twin: &Outcome) -> Result<()> {
     Ok(())
 }
 
-fn check_losses(twin: &Outcome, device: &StepLosses, own_loss: &str) {
+fn check_losses(twin: &Outcome, device: &StepLosses, named: &[&str]) {
     assert_eq!(device.step, STEP);
     let device = |name: &str| -> f64 {
         let terms = TERMS
@@ -292,7 +337,7 @@ fn check_losses(twin: &Outcome, device: &StepLosses, own_loss: &str) {
             .filter(|(term, _)| term.starts_with(name));
         terms.map(|(_, &value)| f64::from(value)).sum()
     };
-    for name in ["color", "eikonal", "interlevel", own_loss] {
+    for &name in named {
         let (device, twin) = (device(name), twin.losses[name]);
         println!("{name} loss {twin:.6}, device {device:.6}");
         assert!(twin > 0.0, "no {name} loss to test");

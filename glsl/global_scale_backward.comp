@@ -1,0 +1,29 @@
+#version 460
+#define LOCAL_SIZE 256
+// The gradient of the one scale that all samples share: the sum of its summands, which leave zeros behind, since they stand where the
+// network's own logit would have its gradient. One workgroup, fixed order.
+#include "lib/prelude.glsl"
+
+layout(push_constant, scalar) uniform Args {
+    F32sMut d_scale;     // [n] consumed
+    F32sMut d_parameter; // [1] accumulated
+    uint n;
+};
+
+shared float partial[LOCAL_SIZE];
+
+void main() {
+    uint lane = gl_LocalInvocationID.x;
+    float sum = 0.0;
+    for (uint p = lane; p < n; p += LOCAL_SIZE) {
+        sum += d_scale.at[p];
+        d_scale.at[p] = 0.0;
+    }
+    partial[lane] = sum;
+    barrier();
+    for (uint stride = LOCAL_SIZE / 2u; stride > 0u; stride /= 2u) {
+        if (lane < stride) partial[lane] += partial[lane + stride];
+        barrier();
+    }
+    if (lane == 0u) d_parameter.at[0] += partial[0];
+}
