@@ -1,21 +1,31 @@
 //! Ctrl-C: the first asks for an orderly end, the second ends at once.
 
 use super::output;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
-/// The flag that the first interrupt (or termination) request sets. `then` says what happens because of it.
+/// The process has one handler, whatever a command does one after another.
+static HANDLER: OnceLock<Arc<AtomicBool>> = OnceLock::new();
+/// What happens because of the first request, at this moment.
+static THEN: Mutex<&str> = Mutex::new("");
+
+/// The flag that the first interrupt (or termination) request sets. `then` says what happens because of it from now on.
 ///
 /// # Errors
-/// If the handler cannot be installed, as when this is called twice.
+/// If the handler cannot be installed.
 pub(super) fn flag(then: &'static str) -> anyhow::Result<Arc<AtomicBool>> {
+    *THEN.lock().unwrap_or_else(PoisonError::into_inner) = then;
+    if let Some(flag) = HANDLER.get() {
+        return Ok(Arc::clone(flag));
+    }
     let flag = Arc::new(AtomicBool::new(false));
     let set = Arc::clone(&flag);
     ctrlc::set_handler(move || {
         if set.swap(true, Ordering::SeqCst) {
             std::process::exit(130);
         }
+        let then = *THEN.lock().unwrap_or_else(PoisonError::into_inner);
         output::line(&format!("interrupted: {then}; once more stops at once"));
     })?;
-    Ok(flag)
+    Ok(Arc::clone(HANDLER.get_or_init(|| flag)))
 }

@@ -1,5 +1,6 @@
 //! The command line: what was typed becomes what is meant; results go to stdout, everything else to stderr.
 
+mod bias;
 pub mod demo;
 mod devices;
 mod diagnostics;
@@ -122,6 +123,7 @@ enum Command {
     Render(render::RenderArgs),
     Eval(eval::EvalArgs),
     Profile(Box<profile::ProfileArgs>),
+    Bias(Box<bias::BiasArgs>),
     Demo(demo::DemoArgs),
 }
 
@@ -135,6 +137,7 @@ impl Command {
             Command::Render(args) => render::run(args, context),
             Command::Eval(args) => eval::run(args, context),
             Command::Profile(args) => profile::run(args, context),
+            Command::Bias(args) => bias::run(args, context),
             Command::Demo(args) => demo::run(args, context),
         }
     }

@@ -205,7 +205,7 @@ fn check_destination(out: &Path, force: bool) -> Result<()> {
 }
 
 /// A file name without extension for each view: the picture's own, or with its folders where those are not all different.
-fn file_names(scene: &Scene) -> Vec<String> {
+pub(super) fn file_names(scene: &Scene) -> Vec<String> {
     let stem = |name: &str| {
         let path = Path::new(name);
         path.file_stem()

@@ -14,7 +14,7 @@ use crate::train::run_directory::{RunDirectory, SceneRecord, scene_options};
 use crate::{Error, Result};
 use anyhow::Context as _;
 use clap::Args;
-use serde_json::json;
+use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
@@ -71,7 +71,44 @@ pub(super) fn run(args: &TrainArgs, context: &Context) -> anyhow::Result<()> {
         context.say("dry run: nothing was written");
         return Ok(context.result(&json!({ "dry_run": true, "config": task.config }), "")?);
     }
-    task.run(args.force, context)
+    let (result, text) = task.run(args.force, context)?;
+    Ok(context.result(&result, &text)?)
+}
+
+/// Trains on a dataset into `out`, or where a run of it is there already goes on with that; what it led to, for programs and for people.
+pub(super) fn train_or_resume(
+    dataset: &Path,
+    out: &Path,
+    settings: SettingsArgs,
+    scene: SceneArgs,
+    context: &Context,
+) -> anyhow::Result<(Value, String)> {
+    let has_checkpoint = RunDirectory::open(out)
+        .and_then(|run| checkpoint::latest(&run.checkpoints()))
+        .is_ok();
+    let args = TrainArgs {
+        dataset: Some(dataset.into()),
+        out: Some(out.into()),
+        resume: has_checkpoint,
+        force: true, // a run without checkpoint holds nothing
+        dry_run: false,
+        print_config: false,
+        settings,
+        scene,
+    };
+    let task = match has_checkpoint {
+        // With the settings that it was begun with.
+        true => {
+            let kept = TrainArgs {
+                settings: SettingsArgs::default(),
+                scene: SceneArgs::default(),
+                ..args
+            };
+            resume(&kept, out, context)?
+        }
+        false => begin(&args, out, context)?,
+    };
+    task.run(true, context)
 }
 
 /// The scene flags' share of the settings.
@@ -333,7 +370,8 @@ fn resume(args: &TrainArgs, out: &Path, context: &Context) -> anyhow::Result<Tas
 }
 
 impl Task {
-    fn run(mut self, force: bool, context: &Context) -> anyhow::Result<()> {
+    /// To the end: what it led to, for programs and for people.
+    fn run(mut self, force: bool, context: &Context) -> anyhow::Result<(Value, String)> {
         let run = match &self.resumed {
             Some(_) => RunDirectory::resume(&self.out)?,
             None => RunDirectory::create(&self.out, force)?,
@@ -398,7 +436,7 @@ impl Task {
             clock(seconds),
             run.root().display()
         );
-        Ok(context.result(&result, &text)?)
+        Ok((result, text))
     }
 }
 

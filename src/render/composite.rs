@@ -44,16 +44,8 @@ impl Composite {
             geometry: config.surface.features,
             appearance: config.appearance.dims,
         };
-        let density = match config.surface.density {
-            DensityKind::Laplace => 0,
-            DensityKind::Sight => 1,
-            DensityKind::Neus => 2,
-        };
-        let scale = match config.surface.scale {
-            ScaleKind::Local => 0,
-            ScaleKind::Beta => 1,
-            ScaleKind::Exponential => 2,
-        };
+        let density = density_of(config.surface.density);
+        let scale = scale_of(config.surface.scale);
         Ok(Composite {
             weights: gpu.scratch("weights", n * samples)?,
             image: gpu.scratch("image", 6 * n)?,
@@ -167,6 +159,23 @@ impl Composite {
             per_ray(look.rays.n, look.sampler.n_samples),
             args,
         );
+    }
+}
+
+/// By the numbers of glsl/lib/optical_depth.glsl.
+pub(super) fn density_of(kind: DensityKind) -> u32 {
+    match kind {
+        DensityKind::Laplace => 0,
+        DensityKind::Sight => 1,
+        DensityKind::Neus => 2,
+    }
+}
+
+pub(super) fn scale_of(kind: ScaleKind) -> u32 {
+    match kind {
+        ScaleKind::Local => 0,
+        ScaleKind::Beta => 1,
+        ScaleKind::Exponential => 2,
     }
 }
 

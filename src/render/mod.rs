@@ -1,5 +1,6 @@
 //! Rays in, images and gradients out: where samples lie, what a ray sees, what is wrong with it.
 
+pub mod bias;
 mod composite;
 mod loss;
 mod rays;
@@ -10,5 +11,5 @@ mod tangent;
 pub use composite::{Composite, Look};
 pub use loss::{Loss, LossScales, TERMS};
 pub use rays::{RayDraws, Rays, ViewTable};
-pub use renderer::{Annealed, Rendered, Renderer, TRAINING};
+pub use renderer::{Annealed, Rendered, Renderer, Shot, TRAINING};
 pub use sampler::Sampler;

@@ -1,9 +1,10 @@
 //! The way from rays to pixels for one batch, with every buffer that it needs; training and evaluation go the same way.
 
+use super::bias;
 use super::composite::{Composite, Look};
 use super::rays::{RayDraws, Rays, ViewTable};
 use super::sampler::Sampler;
-use crate::config::Config;
+use crate::config::{Config, DensityKind};
 use crate::gpu::{Gpu, Recorder};
 use crate::model::{
     BackgroundBuffers, BackgroundRays, Model, ShadeInputs, SurfaceBuffers, TapStep,
@@ -19,6 +20,8 @@ pub struct Renderer {
     pub surface: SurfaceBuffers,
     pub background: BackgroundBuffers,
     pub composite: Composite,
+    /// Whether the surface is asked in the bins' middles, not at their starts.
+    midpoints: bool,
 }
 
 /// What a view looks like, row by row from the top left.
@@ -51,6 +54,16 @@ pub struct Annealed {
     pub curvature_weight: f32,
 }
 
+/// One view: which, how large in pixels, with which appearance code, at which time.
+pub struct Shot<'v> {
+    pub views: &'v ViewTable,
+    /// Row of the table.
+    pub view: u32,
+    pub size: (u32, u32),
+    pub appearance_row: u32,
+    pub now: Annealed,
+}
+
 /// Purposes of random numbers.
 pub const TRAINING: u32 = 0;
 const EVALUATION: u32 = 1;
@@ -73,6 +86,7 @@ impl Renderer {
                 .buffers(gpu, n_rays * config.sampling.samples)?,
             background: model.background.buffers(gpu, n_rays)?,
             composite: Composite::new(gpu, config, n_rays)?,
+            midpoints: config.surface.density == DensityKind::Neus,
         })
     }
 
@@ -135,21 +149,15 @@ impl Renderer {
         self.composite.forward(rec, &self.look(now), model);
     }
 
-    /// Renders a whole view of `width`×`height` pixels. Depth is the distance along the ray in region units. `keep_going` is asked
-    /// between batches and told the share that is done.
-    #[allow(clippy::too_many_arguments)] // one view: which, how large, with which code, at which time
+    /// Renders a whole view. `keep_going` is asked between batches and told the share that is done.
     pub fn view(
         &self,
         gpu: &Gpu,
         model: &Model,
-        views: &ViewTable,
-        view: u32,
-        size: (u32, u32),
-        appearance_row: u32,
-        now: Annealed,
+        shot: &Shot,
         keep_going: &mut dyn FnMut(f64) -> bool,
     ) -> Result<Rendered> {
-        let (width, height) = size;
+        let (width, height) = shot.size;
         let (n, total) = (self.rays.n as usize, width as usize * height as usize);
         let mut out = Rendered {
             width,
@@ -159,6 +167,73 @@ impl Renderer {
             normal: Vec::with_capacity(total),
             accumulation: Vec::with_capacity(total),
         };
+        self.batches(gpu, model, shot, keep_going, &mut |count| {
+            let image = gpu.download(&self.composite.image, 0, self.composite.image.len())?;
+            let normals = gpu.download(&self.composite.normals, 0, self.composite.normals.len())?;
+            for i in 0..count {
+                out.rgb.push([image[i], image[n + i], image[2 * n + i]]);
+                out.accumulation.push(image[3 * n + i]);
+                out.depth.push(image[5 * n + i]);
+                out.normal
+                    .push([normals[i], normals[n + i], normals[2 * n + i]]);
+            }
+            Ok(())
+        })?;
+        Ok(out)
+    }
+
+    /// How far behind the surface each pixel's ray is heaviest, row by row from the top left, in region units ([`super::bias`]); `None`
+    /// where it meets no surface.
+    pub fn bias(
+        &self,
+        gpu: &Gpu,
+        model: &Model,
+        shot: &Shot,
+        keep_going: &mut dyn FnMut(f64) -> bool,
+    ) -> Result<Vec<Option<f32>>> {
+        let (n, samples) = (self.rays.n as usize, self.sampler.n_samples as usize);
+        let mut out = Vec::new();
+        self.batches(gpu, model, shot, keep_going, &mut |count| {
+            let block = self.surface.points.len() / 3;
+            let planes = [0, 1, 2]
+                .map(|axis| gpu.download(&self.surface.points, axis * block, (n * samples) as u64));
+            let [x, y, z] = planes;
+            let points = [x?, y?, z?];
+            let origins = gpu.download(&self.rays.origins, 0, self.rays.origins.len())?;
+            let sdf = gpu.download(&self.surface.sdf, 0, (n * samples) as u64)?;
+            let weights = gpu.download(&self.composite.weights, 0, self.composite.weights.len())?;
+            for ray in 0..count {
+                let row = ray * samples..(ray + 1) * samples;
+                let distance = |p: usize| {
+                    let along = [0, 1, 2].map(|axis| points[axis][p] - origins[axis * n + ray]);
+                    along.iter().map(|x| x * x).sum::<f32>().sqrt()
+                };
+                let distances: Vec<f32> = row.clone().map(distance).collect();
+                out.push(bias::behind_surface(
+                    &distances,
+                    &sdf[row.clone()],
+                    &weights[row],
+                    self.midpoints,
+                ));
+            }
+            Ok(())
+        })?;
+        Ok(out)
+    }
+
+    /// Renders a view batch by batch; `each` is told how many of the batch's rays are pixels.
+    fn batches(
+        &self,
+        gpu: &Gpu,
+        model: &Model,
+        shot: &Shot,
+        keep_going: &mut dyn FnMut(f64) -> bool,
+        each: &mut dyn FnMut(usize) -> Result<()>,
+    ) -> Result<()> {
+        let (n, total) = (
+            self.rays.n as usize,
+            shot.size.0 as usize * shot.size.1 as usize,
+        );
         for first in (0..total).step_by(n) {
             if !keep_going(first as f64 / total as f64) {
                 return Err(Error::Interrupted {
@@ -166,24 +241,21 @@ impl Renderer {
                 });
             }
             gpu.submit("view", |rec| {
-                model.refresh_weights(rec, now.released_levels);
+                model.refresh_weights(rec, shot.now.released_levels);
                 self.draws.fill(rec, first as u64, EVALUATION);
-                self.rays
-                    .through(rec, views, view, first as u32, appearance_row);
-                self.forward(rec, model, now, false);
-                self.composite.normal_map(rec, &self.look(now));
+                self.rays.through(
+                    rec,
+                    shot.views,
+                    shot.view,
+                    first as u32,
+                    shot.appearance_row,
+                );
+                self.forward(rec, model, shot.now, false);
+                self.composite.normal_map(rec, &self.look(shot.now));
                 Ok(())
             })?;
-            let image = gpu.download(&self.composite.image, 0, self.composite.image.len())?;
-            let normals = gpu.download(&self.composite.normals, 0, self.composite.normals.len())?;
-            for i in 0..n.min(total - first) {
-                out.rgb.push([image[i], image[n + i], image[2 * n + i]]);
-                out.accumulation.push(image[3 * n + i]);
-                out.depth.push(image[5 * n + i]);
-                out.normal
-                    .push([normals[i], normals[n + i], normals[2 * n + i]]);
-            }
+            each(n.min(total - first))?;
         }
-        Ok(out)
+        Ok(())
     }
 }

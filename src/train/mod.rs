@@ -14,7 +14,9 @@ use crate::Result;
 use crate::config::{AppearanceAtEval, Config};
 use crate::gpu::{Gpu, Readback, Recorder, Ticket};
 use crate::model::{Background, Model, Proposal, Scratch, Surface, TapStep};
-use crate::render::{Annealed, Loss, LossScales, Rendered, Renderer, TERMS, TRAINING, ViewTable};
+use crate::render::{
+    Annealed, Loss, LossScales, Rendered, Renderer, Shot, TERMS, TRAINING, ViewTable,
+};
 use crate::scene::{Camera, Region, Scene, Split};
 use adam::Adam;
 use schedule::{Now, Schedule};
@@ -295,16 +297,15 @@ impl Trainer {
         appearance: u32,
         keep_going: &mut dyn FnMut(f64) -> bool,
     ) -> Result<Rendered> {
-        self.renderer.view(
-            &self.gpu,
-            &self.model,
-            &self.views,
-            row,
+        let shot = Shot {
+            views: &self.views,
+            view: row,
             size,
-            appearance,
-            self.annealed(),
-            keep_going,
-        )
+            appearance_row: appearance,
+            now: self.annealed(),
+        };
+        self.renderer
+            .view(&self.gpu, &self.model, &shot, keep_going)
     }
 
     /// The annealed numbers that the model is asked with as it is now.

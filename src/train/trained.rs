@@ -6,7 +6,7 @@ use super::schedule::Schedule;
 use crate::config::{AppearanceAtEval, Config};
 use crate::gpu::Gpu;
 use crate::model::Model;
-use crate::render::{Annealed, Rendered, Renderer, ViewTable};
+use crate::render::{Annealed, Rendered, Renderer, Shot, ViewTable};
 use crate::scene::{Region, Scene, Split};
 use crate::{Error, Result};
 use std::path::PathBuf;
@@ -74,6 +74,21 @@ impl Trained {
     /// # Errors
     /// What the device fails with.
     pub fn viewer<'t>(&'t self, scene: &Scene) -> Result<Viewer<'t>> {
+        self.viewer_with(scene, &self.config)
+    }
+
+    /// The same with other numbers of rays and shading samples than in training.
+    ///
+    /// # Errors
+    /// What the device fails with.
+    pub fn fine_viewer<'t>(&'t self, scene: &Scene, rays: u32, samples: u32) -> Result<Viewer<'t>> {
+        let mut config = self.config.clone();
+        config.rays = rays;
+        config.sampling.samples = samples;
+        self.viewer_with(scene, &config)
+    }
+
+    fn viewer_with<'t>(&'t self, scene: &Scene, config: &Config) -> Result<Viewer<'t>> {
         let mean = self.config.appearance.at_eval == AppearanceAtEval::Mean;
         self.model.set_evaluation_code(&self.gpu, mean)?;
         let cameras: Vec<_> = scene
@@ -94,13 +109,7 @@ impl Trained {
             .collect();
         Ok(Viewer {
             trained: self,
-            renderer: Renderer::new(
-                &self.gpu,
-                &self.config,
-                &self.model,
-                &self.region,
-                self.config.rays,
-            )?,
+            renderer: Renderer::new(&self.gpu, config, &self.model, &self.region, config.rays)?,
             views: ViewTable::new(&self.gpu, &self.region, std::iter::empty(), cameras.iter())?,
             codes,
         })
@@ -127,23 +136,41 @@ impl Viewer<'_> {
         view: usize,
         keep_going: &mut dyn FnMut(f64) -> bool,
     ) -> Result<Rendered> {
-        let Trained {
-            gpu, config, model, ..
-        } = self.trained;
-        let code = match (config.appearance.at_eval, self.codes[view]) {
+        let Trained { gpu, model, .. } = self.trained;
+        self.renderer
+            .view(gpu, model, &self.shot(scene, view), keep_going)
+    }
+
+    /// How far behind the surface each of the view's rays is heaviest, in the input's units; `None` where it meets no surface.
+    ///
+    /// # Errors
+    /// As [`Viewer::render`].
+    pub fn bias(
+        &self,
+        scene: &Scene,
+        view: usize,
+        keep_going: &mut dyn FnMut(f64) -> bool,
+    ) -> Result<Vec<Option<f64>>> {
+        let Trained { gpu, model, .. } = self.trained;
+        let shot = self.shot(scene, view);
+        let distances = self.renderer.bias(gpu, model, &shot, keep_going)?;
+        let to_world = |distance: f32| f64::from(distance) * self.trained.region.radius;
+        Ok(distances.into_iter().map(|d| d.map(to_world)).collect())
+    }
+
+    fn shot(&self, scene: &Scene, view: usize) -> Shot<'_> {
+        let Trained { config, model, .. } = self.trained;
+        let appearance_row = match (config.appearance.at_eval, self.codes[view]) {
             (AppearanceAtEval::Frame, Some(own)) => own,
             _ => model.n_views,
         };
         let camera = &scene.views[view].camera;
-        self.renderer.view(
-            gpu,
-            model,
-            &self.views,
-            view as u32,
-            (camera.width, camera.height),
-            code,
-            self.trained.annealed(),
-            keep_going,
-        )
+        Shot {
+            views: &self.views,
+            view: view as u32,
+            size: (camera.width, camera.height),
+            appearance_row,
+            now: self.trained.annealed(),
+        }
     }
 }

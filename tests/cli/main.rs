@@ -1,5 +1,7 @@
 //! The command line from outside: streams, exit codes, messages, and one small run from photographs to mesh.
 
+mod studies;
+
 use serde_json::Value;
 use std::f64::consts::TAU;
 use std::fs;
@@ -131,7 +133,7 @@ fn help_shows_examples_and_exit_codes() {
         assert!(help.stdout.contains(code), "{code} in {}", help.stdout);
     }
     for command in [
-        "devices", "inspect", "train", "mesh", "render", "eval", "profile",
+        "devices", "inspect", "train", "mesh", "render", "eval", "profile", "bias",
     ] {
         assert!(
             help.stdout.contains(&format!("  {command} ")),
