@@ -21,7 +21,7 @@ use crate::scene::{
   neurodin inspect photos/ --preview preview.ply
   neurodin inspect photos/ --center 0,0,0.6 --radius 1.35 --json")]
 pub struct InspectArgs {
-    /// Directory of the dataset, a transforms.json, or the directory of a COLMAP model
+    /// Directory of the dataset, its transforms.json, meta_data.json or cameras_sphere.npz, or the directory of a COLMAP model
     pub dataset: PathBuf,
     /// Write cameras, points and region to this PLY file
     #[arg(long, value_name = "FILE")]

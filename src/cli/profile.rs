@@ -29,7 +29,7 @@ Example:
 The trace opens in chrome://tracing and ui.perfetto.dev. Shares of the roofs compare what a kernel was said to need
 with the fastest copy and the fastest arithmetic that were measured on the device.")]
 pub(super) struct ProfileArgs {
-    /// Directory of the dataset, a transforms.json, or the directory of a COLMAP model
+    /// Directory of the dataset, its transforms.json, meta_data.json or cameras_sphere.npz, or the directory of a COLMAP model
     pub dataset: PathBuf,
     /// Write a Chrome trace of the timed steps to this file
     #[arg(long, value_name = "FILE")]

@@ -136,6 +136,46 @@ fn without_points_cameras_alone_decide() {
 }
 
 #[test]
+fn boxes_and_spheres_of_other_layouts_are_taken() {
+    let rig = Rig::around_a_ball(8);
+    let sdfstudio = |scene_box: Value| {
+        let meta_data = rig.meta_data(json!({"scene_box": scene_box}));
+        estimate(&rig.sdfstudio(&meta_data).open().unwrap())
+    };
+    let region = sdfstudio(json!({
+        "aabb": [[-1, 0, -1], [3, 4, 2]], "near": 0.05, "far": 2.5, "radius": 1.0, "collider_type": "box",
+    }));
+    assert_eq!(
+        (region.center, region.radius),
+        (DVec3::new(1.0, 2.0, 0.5), 2.0)
+    );
+    let half = DVec3::new(1.0, 1.0, 0.75);
+    assert_eq!(region.shape, RegionShape::Box { half });
+    assert!(region.how.contains("scene_box"), "{}", region.how);
+    let region = sdfstudio(
+        json!({"aabb": [[-1, -1, -1], [1, 1, 1]], "radius": 1.5, "collider_type": "sphere"}),
+    );
+    assert_eq!(
+        (region.center, region.radius, region.shape),
+        (DVec3::ZERO, 1.5, RegionShape::Sphere)
+    );
+
+    let center = DVec3::new(1.0, 2.0, 0.5);
+    let scene = rig.neus(center, 1.25).open().unwrap();
+    let region = estimate(&scene);
+    assert_eq!(
+        (region.center, region.radius, region.shape),
+        (center, 1.25, RegionShape::Sphere)
+    );
+    assert!(region.how.contains("scale_mat_0"), "{}", region.how);
+    let other = RegionOverrides {
+        radius: Some(2.0),
+        ..Default::default()
+    };
+    assert_eq!(Region::estimate(&scene, &other).unwrap().radius, 2.0);
+}
+
+#[test]
 fn what_the_dataset_states_is_taken() {
     let rig = Rig::around_a_ball(8);
     let center = DVec3::new(1.0, 2.0, 0.5);
