@@ -13,6 +13,7 @@ mod progress;
 mod render;
 mod scene_args;
 mod settings;
+mod suggestion;
 mod train;
 
 use clap::{

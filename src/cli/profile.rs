@@ -69,7 +69,8 @@ pub(super) fn run(args: &ProfileArgs, context: &Context) -> anyhow::Result<()> {
         ..args.settings.clone()
     };
     let scene = open_scene(&settings, &args.scene, &args.dataset)?;
-    let (config, chosen) = configure(&settings, &args.scene, &scene)?;
+    let chosen = configure(&settings, &args.scene, &scene)?;
+    let config = chosen.config;
     let config = match args.settings.stage {
         Some(2) => config.second_stage().ok_or_else(|| Error::Config {
             what: "stage2.steps = 0: there is no second stage to time".into(),
@@ -81,7 +82,7 @@ pub(super) fn run(args: &ProfileArgs, context: &Context) -> anyhow::Result<()> {
         profile: true,
         ..GpuOptions::default()
     })?;
-    context.say(&format!("preset   {}{chosen}", config.preset));
+    context.say(&format!("preset   {}{}", config.preset, chosen.why));
     context.say(&format!("device   {}", gpu.info().name));
     let roofs = gpu.measure_roofs()?;
     let mut trainer = Trainer::new(&gpu, &scene, &region, &config)?;

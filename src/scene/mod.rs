@@ -7,6 +7,7 @@
 //! rigid. Pixel (0.5, 0.5) is the centre of the first pixel. Where a layout holds two frames, the world is the one that its cameras
 //! are written in: for sdfstudio that of `camtoworld`, for NeuS that of `world_mat` (before `scale_mat`).
 
+mod beyond;
 mod bounds;
 mod camera;
 mod colmap;
@@ -29,6 +30,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::{Error, Result};
 
+pub use beyond::Beyond;
 pub use bounds::{Facing, Looks, Region, RegionOverrides, RegionShape};
 pub use camera::{Camera, CameraModel, UNSUPPORTED_MODELS};
 pub use images::Picture;
