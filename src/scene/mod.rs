@@ -35,6 +35,7 @@ pub use bounds::{Facing, Looks, Region, RegionOverrides, RegionShape};
 pub use camera::{Camera, CameraModel, UNSUPPORTED_MODELS};
 pub use images::Picture;
 pub use preview::write_preview;
+pub use sdfstudio::truth_from_world;
 
 /// A dataset: posed views, sparse points where it has any, and what its author said of the region.
 #[derive(Clone, Debug)]

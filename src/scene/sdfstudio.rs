@@ -58,8 +58,11 @@ pub(super) fn read(file: &Path) -> Result<Reading> {
     })
 }
 
-/// The `worldtogt` of a meta_data.json.
-pub(super) fn read_world_to_truth(file: &Path) -> Result<Option<DMat4>> {
+/// The `worldtogt` of a meta_data.json: from the coordinates of its cameras to those of the ground truth.
+///
+/// # Errors
+/// [`Error::Input`] for a file that is none, or a matrix that is none.
+pub fn truth_from_world(file: &Path) -> Result<Option<DMat4>> {
     Document::open(file)?.world_to_truth()
 }
 
