@@ -144,6 +144,13 @@ impl Arrays {
 
 /// The array in the bytes of an .npy file, or what is wrong with it.
 fn decode<T: Copy>(bytes: &[u8], of: impl Fn(f64) -> T) -> Result<Array<T>, String> {
+    // From version 2 on a header may state a length of up to 4 GiB, which would be allocated before it is read.
+    if let [_, _, _, _, _, _, 2..=u8::MAX, _, length @ ..] = bytes
+        && let Some(length) = length.first_chunk()
+        && u32::from_le_bytes(*length) as usize > bytes.len()
+    {
+        return Err("ends within its header".into());
+    }
     let array = NpyFile::new(bytes).map_err(|error| format!("is no array by NumPy: {error}"))?;
     let shape: Vec<usize> = array
         .shape()

@@ -643,6 +643,12 @@ fn masks_planes_and_alignments_of_another_shape_are_refused() {
         &format!("{dtu} Plane1.mat"),
         &["Plane1.mat", "scipy.io", "savez"],
     );
+    let header = [&b"\x93NUMPY\x02\x00"[..], &[0xff; 40]].concat();
+    std::fs::write(files.path("long.npy"), header).unwrap();
+    files.refuses(
+        &format!("{dtu} long.npy"),
+        &["long.npy", "ends within its header"],
+    );
     files.write("plane.csv", "1,2,3,4");
     files.refuses(
         &format!("{dtu} plane.csv"),
