@@ -4,6 +4,7 @@
 //! ([`model`]) → optimiser steps and checkpoints ([`train`]) → triangle mesh ([`mesh`]) → scores ([`eval`]). Everything that runs on
 //! the device goes through [`gpu`], the only module that knows Vulkan.
 
+mod arrays;
 pub mod cli;
 pub mod config;
 pub mod error;

@@ -1,12 +1,13 @@
 //! `neurodin eval`: how well a run renders held-out views, or how far a mesh is from the true surface.
 
 mod pictures;
+pub mod protocol;
 
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use glam::DVec3;
+use glam::{DMat4, DVec3};
 use serde_json::{Value, json};
 
 use super::Context;
@@ -15,9 +16,10 @@ use super::scene_args::numbers;
 use crate::eval::geometry::{
     Distances, GeometryOptions, GeometryScores, Reference, score_geometry,
 };
-use crate::mesh::{bounds, read_mesh};
+use crate::mesh::{Mesh, bounds, read_mesh};
 use crate::scene::{Scene, SceneOptions, Split, View};
 use crate::{Error, Result};
+use protocol::{Protocol, ProtocolArgs};
 
 /// Score a training run's pictures, or a mesh against the true surface
 #[derive(Args, Clone, Debug)]
@@ -25,8 +27,14 @@ use crate::{Error, Result};
   neurodin eval run/
   neurodin eval --mesh mesh.ply --reference scan.ply --thresholds 0.005,0.01
   neurodin eval --mesh mesh.ply --reference true.ply --reference points.ply --crop -1,-1,0,1,1,2 --visible-from photos/ --json
+  neurodin eval --mesh mesh.ply --reference scan.ply --align photos/meta_data.json
+  neurodin eval --mesh mesh.ply --reference Barn.ply --protocol tnt --scene Barn --align Barn_trans.txt --crop-polygon Barn.json
+  neurodin eval --mesh mesh.ply --reference stl024_total.ply --protocol dtu --observed ObsMask24_10.npz --plane Plane24.npz
 
-Thresholds, distances and boxes are in the coordinates of the mesh and its reference, which must be the same.")]
+Thresholds, distances and boxes are in the coordinates of the reference, which are those of the mesh or what --align makes of them.
+
+DTU's MATLAB files become .npz by
+  python3 -c \"import sys, numpy, scipy.io; numpy.savez(sys.argv[2], **{k: v for k, v in scipy.io.loadmat(sys.argv[1]).items() if k[0] != '_'})\" IN.mat OUT.npz")]
 #[command(group = clap::ArgGroup::new("scored").required(true).args(["run", "mesh"]))]
 pub struct EvalArgs {
     /// Run directory: PSNR and SSIM of its held-out views
@@ -61,12 +69,14 @@ pub struct EvalArgs {
     /// A place is hidden by what is nearer to the camera by more than this [default: 0.1 % of half the reference's diagonal]
     #[arg(long, value_name = "D", requires = "visible_from")]
     pub hidden_by: Option<f64>,
-    /// Points drawn on a mesh
+    /// Points drawn on a mesh (--protocol plain)
     #[arg(long, value_name = "N", default_value_t = 500_000)]
     pub samples: usize,
     /// Seed of the points
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub seed: u64,
+    #[command(flatten)]
+    pub protocols: ProtocolArgs,
 }
 
 pub(super) fn run(args: &EvalArgs, context: &Context) -> anyhow::Result<()> {
@@ -83,8 +93,32 @@ pub(super) fn run(args: &EvalArgs, context: &Context) -> anyhow::Result<()> {
 /// # Errors
 /// Those of reading the files and the dataset; `Config` where nothing can be compared.
 pub fn score_mesh(args: &EvalArgs, mesh: &Path) -> Result<(Value, String)> {
-    let ours = read_mesh(mesh)?;
+    protocol::check_flags(args)?;
+    let mut ours = read_mesh(mesh)?;
+    let truth_from_mesh = protocol::truth_from_mesh(args)?;
+    for p in &mut ours.positions {
+        *p = truth_from_mesh.transform_point3(*p);
+    }
     let reference = read_reference(&args.reference)?;
+    let (scores, text) = match args.protocols.protocol {
+        Protocol::Plain => plain(args, &ours, &reference, truth_from_mesh)?,
+        Protocol::Tnt => protocol::tanks(args, &ours, reference)?,
+        Protocol::Dtu => protocol::dtu(args, &ours, reference)?,
+    };
+    let mut report = json!({ "mesh": mesh, "reference": args.reference });
+    if let (Some(report), Value::Object(scores)) = (report.as_object_mut(), scores) {
+        report.extend(scores);
+    }
+    Ok((report, text))
+}
+
+/// Distances both ways, as the options ask.
+fn plain(
+    args: &EvalArgs,
+    ours: &Mesh,
+    reference: &Reference,
+    truth_from_mesh: DMat4,
+) -> Result<(Value, String)> {
     let crop = args.crop.map(corners);
     let [low, high] = crop.or(reference.bounds()).ok_or_else(|| {
         let next = "give a mesh or points of the true surface";
@@ -106,16 +140,10 @@ pub fn score_mesh(args: &EvalArgs, mesh: &Path) -> Result<(Value, String)> {
     let views = args
         .visible_from
         .as_ref()
-        .map(|dataset| training_views(dataset))
+        .map(|dataset| training_views(dataset, truth_from_mesh))
         .transpose()?;
-    let scores = score_geometry(&ours, &reference, views.as_deref(), &options)?;
-    let mut report = json!({ "mesh": mesh, "reference": args.reference });
-    if let (Some(report), Ok(Value::Object(scores))) =
-        (report.as_object_mut(), serde_json::to_value(&scores))
-    {
-        report.extend(scores);
-    }
-    Ok((report, as_text(&scores)))
+    let scores = score_geometry(ours, reference, views.as_deref(), &options)?;
+    Ok((json!(scores), as_text(&scores)))
 }
 
 /// The lower and the upper corner, from any two opposite ones.
@@ -146,8 +174,8 @@ fn read_reference(paths: &[PathBuf]) -> Result<Reference> {
     Ok(reference)
 }
 
-/// All views that are not set apart by the dataset itself.
-fn training_views(dataset: &Path) -> Result<Vec<View>> {
+/// All views that are not set apart by the dataset itself, with the mesh's coordinates taken to those of the truth.
+fn training_views(dataset: &Path, truth_from_mesh: DMat4) -> Result<Vec<View>> {
     let options = SceneOptions {
         holdout: 0,
         masks: false,
@@ -158,6 +186,11 @@ fn training_views(dataset: &Path) -> Result<Vec<View>> {
         .views
         .into_iter()
         .filter(|view| view.split == Split::Train)
+        .map(|view| View {
+            // Not rigid any more, which no projection of a point minds.
+            world_from_camera: truth_from_mesh * view.world_from_camera,
+            ..view
+        })
         .collect())
 }
 

@@ -9,9 +9,10 @@ use serde_json::{Value, json};
 
 use super::Context;
 use super::scene_args::SceneArgs;
+use super::suggestion::Suggestion;
 use crate::Error;
 use crate::scene::{
-    Facing, Looks, Region, RegionOverrides, RegionShape, Scene, SceneOptions, Split, write_preview,
+    Facing, Region, RegionOverrides, RegionShape, Scene, SceneOptions, Split, write_preview,
 };
 
 /// Say what a dataset holds, what was skipped, and which region would be reconstructed
@@ -21,7 +22,7 @@ use crate::scene::{
   neurodin inspect photos/ --preview preview.ply
   neurodin inspect photos/ --center 0,0,0.6 --radius 1.35 --json")]
 pub struct InspectArgs {
-    /// Directory of the dataset, a transforms.json, or the directory of a COLMAP model
+    /// Directory of the dataset, its transforms.json, meta_data.json or cameras_sphere.npz, or the directory of a COLMAP model
     pub dataset: PathBuf,
     /// Write cameras, points and region to this PLY file
     #[arg(long, value_name = "FILE")]
@@ -48,13 +49,13 @@ pub(super) fn run(args: &InspectArgs, context: &Context) -> anyhow::Result<()> {
         .into());
     }
     let scene = Scene::open(&args.dataset, &args.scene.options(&SceneOptions::default()))?;
-    let looks = Looks::of(&scene);
     let region = Region::estimate(&scene, &args.scene.overrides(&RegionOverrides::default()))?;
+    let suggestion = Suggestion::for_scene(&scene, &args.scene)?;
     if let Some(preview) = &args.preview {
         write_preview(&scene, &region, preview)?;
     }
-    let report = report(&scene, &looks, &region, args.preview.as_ref());
-    let text = as_text(&scene, &looks, &region, args.preview.as_ref());
+    let report = report(&scene, &suggestion, &region, args.preview.as_ref());
+    let text = as_text(&scene, &suggestion, &region, args.preview.as_ref());
     context.result(&report, &text)?;
     Ok(())
 }
@@ -72,7 +73,7 @@ fn cameras(scene: &Scene) -> BTreeMap<(&'static str, u32, u32), usize> {
 }
 
 /// What a reader of the report should do something about.
-fn warnings(scene: &Scene, looks: &Looks, region: &Region) -> Vec<String> {
+fn warnings(scene: &Scene, facing: Facing, region: &Region) -> Vec<String> {
     let mut warnings = Vec::new();
     let train = scene.split(Split::Train).count();
     if train < 20 {
@@ -81,7 +82,7 @@ fn warnings(scene: &Scene, looks: &Looks, region: &Region) -> Vec<String> {
         ));
     }
     let inside = region.cameras_inside(scene);
-    if looks.facing == Facing::Outward && inside < scene.views.len() {
+    if facing == Facing::Outward && inside < scene.views.len() {
         let outside = scene.views.len() - inside;
         warnings.push(format!(
             "the cameras look outwards, but {outside} of {} stand outside the region: enlarge it (--region-scale, --radius)",
@@ -100,7 +101,7 @@ fn warnings(scene: &Scene, looks: &Looks, region: &Region) -> Vec<String> {
         .iter()
         .filter(|view| view.sees(region.center).is_some())
         .count();
-    if looks.facing == Facing::Inward && seeing * 2 < scene.views.len() {
+    if facing == Facing::Inward && seeing * 2 < scene.views.len() {
         warnings.push(format!(
             "the region's centre is in {seeing} of {} pictures only",
             scene.views.len()
@@ -109,15 +110,12 @@ fn warnings(scene: &Scene, looks: &Looks, region: &Region) -> Vec<String> {
     warnings
 }
 
-/// Presets for scenes that are looked at from where these cameras stand.
-fn suggestion(facing: Facing) -> &'static str {
-    match facing {
-        Facing::Inward => "outdoor",
-        Facing::Outward => "indoor",
-    }
-}
-
-fn report(scene: &Scene, looks: &Looks, region: &Region, preview: Option<&PathBuf>) -> Value {
+fn report(
+    scene: &Scene,
+    suggestion: &Suggestion,
+    region: &Region,
+    preview: Option<&PathBuf>,
+) -> Value {
     let cameras: Vec<Value> = cameras(scene)
         .into_iter()
         .map(|((model, width, height), views)| json!({"model": model, "width": width, "height": height, "views": views}))
@@ -132,8 +130,10 @@ fn report(scene: &Scene, looks: &Looks, region: &Region, preview: Option<&PathBu
         },
         "cameras": cameras,
         "points": scene.points.len(),
-        "looks": looks,
-        "presets": suggestion(looks.facing),
+        "looks": suggestion.looks,
+        "beyond": suggestion.beyond,
+        "presets": suggestion.kind(),
+        "suggested": { "preset": suggestion.preset(), "settings": suggestion.settings() },
         "region": region,
         "inside": {
             "cameras": region.cameras_inside(scene),
@@ -141,12 +141,17 @@ fn report(scene: &Scene, looks: &Looks, region: &Region, preview: Option<&PathBu
         },
         "skipped": scene.skipped,
         "notes": scene.notes,
-        "warnings": warnings(scene, looks, region),
+        "warnings": warnings(scene, suggestion.looks.facing, region),
         "preview": preview,
     })
 }
 
-fn as_text(scene: &Scene, looks: &Looks, region: &Region, preview: Option<&PathBuf>) -> String {
+fn as_text(
+    scene: &Scene,
+    suggestion: &Suggestion,
+    region: &Region,
+    preview: Option<&PathBuf>,
+) -> String {
     let mut text = String::new();
     let mut row = |name: &str, value: String| {
         let _ = writeln!(text, "{name:<10} {value}");
@@ -172,16 +177,30 @@ fn as_text(scene: &Scene, looks: &Looks, region: &Region, preview: Option<&PathB
         row("camera", format!("{model} {width}x{height}, {views} views"));
     }
     row("points", format!("{}", scene.points.len()));
-    let (facing, why) = match looks.facing {
-        Facing::Inward => ("inwards, at an object or building", &looks.why),
-        Facing::Outward => ("outwards, from within a room", &looks.why),
+    let looks = &suggestion.looks;
+    let facing = match looks.facing {
+        Facing::Inward => "inwards, at an object or building",
+        Facing::Outward => "outwards, from within a room",
     };
-    row("look", format!("{facing}: {why}"));
+    row("look", format!("{facing}: {}", looks.why));
+    if let Some(beyond) = &suggestion.beyond {
+        let what = match beyond.runs_on {
+            true => "ground and surroundings run on",
+            false => "an even backdrop",
+        };
+        row("beyond", format!("{what}: {}", beyond.why));
+    }
+    let settings: Vec<String> = suggestion
+        .settings()
+        .iter()
+        .map(|setting| format!(" --set {setting}"))
+        .collect();
+    let (kind, preset) = (suggestion.kind(), suggestion.preset());
     row(
-        "",
+        "suggested",
         format!(
-            "presets for such scenes begin with {}-",
-            suggestion(looks.facing)
+            "{kind} presets: --preset {preset}{}, or {kind}-large on a GPU",
+            settings.concat()
         ),
     );
     let (center, radius) = (region.center, region.radius);
@@ -218,7 +237,7 @@ fn as_text(scene: &Scene, looks: &Looks, region: &Region, preview: Option<&PathB
     for note in &scene.notes {
         row("note", note.clone());
     }
-    for warning in warnings(scene, looks, region) {
+    for warning in warnings(scene, suggestion.looks.facing, region) {
         row("warning", warning);
     }
     if let Some(preview) = preview {

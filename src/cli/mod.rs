@@ -14,6 +14,7 @@ mod progress;
 mod render;
 mod scene_args;
 mod settings;
+mod suggestion;
 mod train;
 
 use clap::{

@@ -29,7 +29,7 @@ Example:
 The trace opens in chrome://tracing and ui.perfetto.dev. Shares of the roofs compare what a kernel was said to need
 with the fastest copy and the fastest arithmetic that were measured on the device.")]
 pub(super) struct ProfileArgs {
-    /// Directory of the dataset, a transforms.json, or the directory of a COLMAP model
+    /// Directory of the dataset, its transforms.json, meta_data.json or cameras_sphere.npz, or the directory of a COLMAP model
     pub dataset: PathBuf,
     /// Write a Chrome trace of the timed steps to this file
     #[arg(long, value_name = "FILE")]
@@ -69,7 +69,8 @@ pub(super) fn run(args: &ProfileArgs, context: &Context) -> anyhow::Result<()> {
         ..args.settings.clone()
     };
     let scene = open_scene(&settings, &args.scene, &args.dataset)?;
-    let (config, chosen) = configure(&settings, &args.scene, &scene)?;
+    let chosen = configure(&settings, &args.scene, &scene)?;
+    let config = chosen.config;
     let config = match args.settings.stage {
         Some(2) => config.second_stage().ok_or_else(|| Error::Config {
             what: "stage2.steps = 0: there is no second stage to time".into(),
@@ -81,7 +82,7 @@ pub(super) fn run(args: &ProfileArgs, context: &Context) -> anyhow::Result<()> {
         profile: true,
         ..GpuOptions::default()
     })?;
-    context.say(&format!("preset   {}{chosen}", config.preset));
+    context.say(&format!("preset   {}{}", config.preset, chosen.why));
     context.say(&format!("device   {}", gpu.info().name));
     let roofs = gpu.measure_roofs()?;
     let mut trainer = Trainer::new(&gpu, &scene, &region, &config)?;

@@ -3,10 +3,11 @@
 use super::progress::{Progress, clock};
 use super::scene_args::SceneArgs;
 use super::settings::SettingsArgs;
+use super::suggestion::Suggestion;
 use super::{Context, diagnostics, interrupt};
 use crate::config::{Config, Effect, MaskUse, RegionKind};
 use crate::gpu::Gpu;
-use crate::scene::{Facing, Looks, Region, RegionOverrides, RegionShape, Scene, Split};
+use crate::scene::{Region, RegionOverrides, RegionShape, Scene, Split};
 use crate::train::Trainer;
 use crate::train::checkpoint::{self, Latest};
 use crate::train::report::{Control, Event, Log};
@@ -28,7 +29,7 @@ Example:
   neurodin train --out run --resume
   neurodin train --preset indoor-tiny --print-config > mine.toml")]
 pub(super) struct TrainArgs {
-    /// Directory of the dataset, a transforms.json, or the directory of a COLMAP model; with --resume only if it has moved
+    /// Directory of the dataset, its transforms.json, meta_data.json or cameras_sphere.npz, or the directory of a COLMAP model; with --resume only if it has moved
     #[arg(required_unless_present_any = ["resume", "print_config"])]
     pub dataset: Option<PathBuf>,
     /// Run directory to write
@@ -112,7 +113,7 @@ pub(super) fn train_or_resume(
 }
 
 /// The scene flags' share of the settings.
-fn with_scene_flags(args: &SceneArgs, config: Config) -> Result<Config> {
+pub(super) fn with_scene_flags(args: &SceneArgs, config: Config) -> Result<Config> {
     let mut config = config;
     if let Some(downscale) = args.downscale {
         config.scene.downscale = downscale;
@@ -134,25 +135,37 @@ fn described(settings: &SettingsArgs, scene: &SceneArgs) -> Result<Config> {
     with_scene_flags(scene, settings.resolve(Config::preset("outdoor-tiny")?)?)
 }
 
-/// The settings for a new run on a dataset, and why its preset was chosen if it was not named.
+/// The settings for a new run on a dataset.
+pub(super) struct Chosen {
+    pub config: Config,
+    /// Why the preset was chosen, if it was not named.
+    pub why: String,
+    /// What speaks against it, if it was.
+    pub doubts: Vec<String>,
+}
+
+/// Chooses the settings: those that were asked for, on top of what the dataset suggests where no preset was named.
 pub(super) fn configure(
     settings: &SettingsArgs,
     flags: &SceneArgs,
     scene: &Scene,
-) -> Result<(Config, String)> {
+) -> Result<Chosen> {
     if settings.names_preset()? {
-        return Ok((described(settings, flags)?, String::new()));
+        let config = described(settings, flags)?;
+        let region = Region::estimate(scene, &region_wanted(flags, &config))?;
+        return Ok(Chosen {
+            doubts: Suggestion::of(scene, &region)?.doubts(&config),
+            why: String::new(),
+            config,
+        });
     }
-    let looks = Looks::of(scene);
-    let (name, kind) = match looks.facing {
-        Facing::Inward => ("outdoor-tiny", "inwards"),
-        Facing::Outward => ("indoor-tiny", "outwards"),
-    };
-    let config = with_scene_flags(flags, settings.resolve(Config::preset(name)?)?)?;
-    Ok((
+    let suggestion = Suggestion::for_scene(scene, flags)?;
+    let config = with_scene_flags(flags, settings.resolve(suggestion.config()?)?)?;
+    Ok(Chosen {
+        why: suggestion.in_words(),
+        doubts: suggestion.doubts(&config),
         config,
-        format!(" (the cameras look {kind}; --preset chooses another)"),
-    ))
+    })
 }
 
 /// What flags and settings say of the region.
@@ -195,7 +208,8 @@ fn begin(args: &TrainArgs, out: &Path, context: &Context) -> anyhow::Result<Task
     RunDirectory::check_free(out, args.force)?;
     let dataset = args.dataset.as_deref().expect("clap requires it");
     let scene = open_scene(&args.settings, &args.scene, dataset)?;
-    let (config, chosen) = configure(&args.settings, &args.scene, &scene)?;
+    let chosen = configure(&args.settings, &args.scene, &scene)?;
+    let config = chosen.config;
     let region = Region::estimate(&scene, &region_wanted(&args.scene, &config))?;
     context.say(&format!(
         "dataset  {}, {}: {} views to train on, {} held out{}",
@@ -210,11 +224,15 @@ fn begin(args: &TrainArgs, out: &Path, context: &Context) -> anyhow::Result<Task
     ));
     context.say(&format!("region   {}", in_words(&region)));
     context.say(&format!(
-        "preset   {}{chosen}, {}, seed {}",
+        "preset   {}{}, {}, seed {}",
         config.preset,
+        chosen.why,
         in_stages(&config),
         config.seed
     ));
+    for doubt in &chosen.doubts {
+        context.warn(doubt);
+    }
     let gpu = context.gpu()?;
     let trainer = Trainer::new(&gpu, &scene, &region, &config)?;
     say_device(&gpu, args.dry_run, context);

@@ -92,6 +92,23 @@ pub struct ThresholdScore {
     pub f_score: f64,
 }
 
+impl ThresholdScore {
+    /// With F, which is 0 where both others are.
+    pub(super) fn new(threshold: f64, precision: f64, recall: f64) -> Self {
+        let f_score = if precision + recall > 0.0 {
+            2.0 * precision * recall / (precision + recall)
+        } else {
+            0.0
+        };
+        ThresholdScore {
+            threshold,
+            precision,
+            recall,
+            f_score,
+        }
+    }
+}
+
 /// All scores of a mesh.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct GeometryScores {
@@ -174,6 +191,11 @@ pub fn score_geometry<V: Viewpoint>(
     ))
 }
 
+/// The share of distances that are `near`; 0 of none.
+pub(super) fn share(distances: &[f64], near: impl Fn(f64) -> bool) -> f64 {
+    distances.iter().filter(|&&d| near(d)).count() as f64 / distances.len().max(1) as f64
+}
+
 /// Scores from the two lists of distances.
 fn summary(
     mesh: &Mesh,
@@ -182,22 +204,9 @@ fn summary(
     completeness: &[f64],
     options: &GeometryOptions,
 ) -> GeometryScores {
-    let share = |distances: &[f64], threshold: f64| {
-        distances.iter().filter(|&&d| d <= threshold).count() as f64 / distances.len().max(1) as f64
-    };
     let thresholds = options.thresholds.iter().map(|&threshold| {
-        let (precision, recall) = (share(accuracy, threshold), share(completeness, threshold));
-        let f_score = if precision + recall > 0.0 {
-            2.0 * precision * recall / (precision + recall)
-        } else {
-            0.0
-        };
-        ThresholdScore {
-            threshold,
-            precision,
-            recall,
-            f_score,
-        }
+        let near = |d: f64| d <= threshold;
+        ThresholdScore::new(threshold, share(accuracy, near), share(completeness, near))
     });
     let thresholds = thresholds.collect();
     let accuracy = Distances::of(accuracy, options.trim);
@@ -409,18 +418,23 @@ fn draw_uncropped(mesh: &Mesh, faces: &[usize], n: usize, seed: u64) -> Vec<(DVe
     (0..n).into_par_iter().map(point).collect()
 }
 
-/// Three numbers in [0, 1) that depend on nothing but (seed, index): SplitMix64 (Steele, Lea & Flood 2014).
+/// Three numbers in [0, 1) that depend on nothing but (seed, index).
 fn uniforms(seed: u64, index: u64) -> [f64; 3] {
+    std::array::from_fn(|i| {
+        let bits = mixed(seed, index.wrapping_mul(3).wrapping_add(i as u64));
+        (bits >> 11) as f64 / (1u64 << 53) as f64
+    })
+}
+
+/// Bits that depend on nothing but (seed, index): SplitMix64 (Steele, Lea & Flood 2014).
+pub(super) fn mixed(seed: u64, index: u64) -> u64 {
     let mix = |x: u64| {
         let x = (x ^ (x >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
         let x = (x ^ (x >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
         x ^ (x >> 31)
     };
-    let start = mix(seed.wrapping_mul(0x9e37_79b9_7f4a_7c15)).wrapping_add(index.wrapping_mul(3));
-    std::array::from_fn(|i| {
-        let bits = mix(start
-            .wrapping_add(i as u64)
-            .wrapping_mul(0x9e37_79b9_7f4a_7c15));
-        (bits >> 11) as f64 / (1u64 << 53) as f64
-    })
+    let start = mix(seed.wrapping_mul(0x9e37_79b9_7f4a_7c15));
+    mix(start
+        .wrapping_add(index)
+        .wrapping_mul(0x9e37_79b9_7f4a_7c15))
 }

@@ -76,7 +76,7 @@ pub struct Looks {
 }
 
 /// Fewer points than this say nothing about a region.
-const ENOUGH_POINTS: usize = 50;
+pub(super) const ENOUGH_POINTS: usize = 50;
 /// Points and cameras looked at for visibility: more would not change a percentile.
 const SAMPLED_POINTS: usize = 20_000;
 const SAMPLED_CAMERAS: usize = 128;
@@ -441,12 +441,12 @@ fn nearest_to_axes(views: &[&View]) -> Option<DVec3> {
     (fixed.is_finite() && fixed > 2e-3).then(|| inverse * right)
 }
 
-fn train_views(scene: &Scene) -> impl Iterator<Item = &View> {
+pub(super) fn train_views(scene: &Scene) -> impl Iterator<Item = &View> {
     scene.views.iter().filter(|view| view.split == Split::Train)
 }
 
 /// Evenly strided, so that the same dataset gives the same region.
-fn sampled_points(scene: &Scene) -> Vec<DVec3> {
+pub(super) fn sampled_points(scene: &Scene) -> Vec<DVec3> {
     let stride = scene.points.len().div_ceil(SAMPLED_POINTS).max(1);
     scene
         .points

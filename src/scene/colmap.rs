@@ -12,6 +12,7 @@ use std::path::{Path, PathBuf};
 
 use glam::{DMat4, DQuat, DVec3};
 
+use super::json::file_name;
 use super::{Camera, CameraModel, Format, Frame, FrameLens, Point, Reading, Skipped};
 use crate::{Error, Result};
 
@@ -120,6 +121,7 @@ pub(super) fn read(path: &Path, model: &Path) -> Result<Reading> {
         skipped,
         notes,
         world_from_colmap: DMat4::IDENTITY,
+        truth_from_world: None,
     })
 }
 
@@ -172,8 +174,9 @@ fn note_other_models(model: &Path, skipped: &mut Vec<Skipped>) {
     }
 }
 
-/// Gives a transforms.json the points of the COLMAP model beside it, if both have their cameras in the same places.
+/// Gives a dataset of another layout the points of the COLMAP model beside it, if both have their cameras in the same places.
 pub(super) fn adopt_points(reading: &mut Reading, model: &Path) {
+    let used = file_name(&reading.file);
     let mut skip = |why: String| {
         reading.skipped.push(Skipped {
             what: model.display().to_string(),
@@ -184,16 +187,15 @@ pub(super) fn adopt_points(reading: &mut Reading, model: &Path) {
         Some(Ok(images)) => images,
         Some(Err(error)) => {
             return skip(format!(
-                "transforms.json is used, and this COLMAP model is not readable: {error}"
+                "{used} is used, and this COLMAP model is not readable: {error}"
             ));
         }
-        None => return skip("transforms.json is used; this COLMAP model has no images".into()),
+        None => return skip(format!("{used} is used; this COLMAP model has no images")),
     };
     if !reading.points.is_empty() {
-        return skip(
-            "transforms.json is used, with its own points; give this path to use the COLMAP model"
-                .into(),
-        );
+        return skip(format!(
+            "{used} is used, with its own points; give this path to use the COLMAP model"
+        ));
     }
     let world = reading.world_from_colmap;
     let base = |name: &str| name.rsplit('/').next().unwrap_or(name).to_owned();
@@ -226,12 +228,12 @@ pub(super) fn adopt_points(reading: &mut Reading, model: &Path) {
         .count();
     if pairs.len() < 3 || agree * 10 < pairs.len() * 9 {
         return skip(format!(
-            "transforms.json is used; this COLMAP model has {agree} of {} cameras in the same places, so its points are of another frame",
+            "{used} is used; this COLMAP model has {agree} of {} cameras in the same places, so its points are of another frame",
             reading.frames.len()
         ));
     }
     let Some(file) = part(model, "points3D") else {
-        return skip("transforms.json is used; this COLMAP model has no points".into());
+        return skip(format!("{used} is used; this COLMAP model has no points"));
     };
     match read_points(&file, &mut reading.notes) {
         Ok(mut points) => {

@@ -4,14 +4,20 @@
 //! [`Region::estimate`] chooses the part of space to reconstruct.
 //!
 //! Frames of reference: the world is that of the input. A camera looks along its -z with y up (OpenGL), and `world_from_camera` is
-//! rigid. Pixel (0.5, 0.5) is the centre of the first pixel.
+//! rigid. Pixel (0.5, 0.5) is the centre of the first pixel. Where a layout holds two frames, the world is the one that its cameras
+//! are written in: for sdfstudio that of `camtoworld`, for NeuS that of `world_mat` (before `scale_mat`).
 
+mod beyond;
 mod bounds;
 mod camera;
 mod colmap;
 mod images;
+mod json;
+mod mvsnet;
+mod neus;
 mod points;
 mod preview;
+mod sdfstudio;
 pub mod synthetic;
 mod transforms;
 
@@ -24,10 +30,12 @@ use serde::{Deserialize, Serialize};
 
 use crate::{Error, Result};
 
+pub use beyond::Beyond;
 pub use bounds::{Facing, Looks, Region, RegionOverrides, RegionShape};
 pub use camera::{Camera, CameraModel, UNSUPPORTED_MODELS};
 pub use images::Picture;
 pub use preview::write_preview;
+pub use sdfstudio::truth_from_world;
 
 /// A dataset: posed views, sparse points where it has any, and what its author said of the region.
 #[derive(Clone, Debug)]
@@ -40,6 +48,8 @@ pub struct Scene {
     /// Sparse points, world frame; empty where the dataset has none.
     pub points: Vec<Point>,
     pub region_hint: Option<RegionHint>,
+    /// Into the frame of the ground truth, where the dataset states it (sdfstudio's worldtogt): a similarity.
+    pub truth_from_world: Option<DMat4>,
     /// What was there, or should have been, and is not used.
     pub skipped: Vec<Skipped>,
     /// What was done to the input that its author may want to know of, such as scaled intrinsics.
@@ -62,6 +72,12 @@ pub enum Format {
     Neuralangelo,
     /// transforms_train.json, transforms_test.json
     Blender,
+    /// meta_data.json
+    Sdfstudio,
+    /// cameras_sphere.npz
+    Neus,
+    /// cams/*_cam.txt
+    VisMvsnet,
 }
 
 impl std::fmt::Display for Format {
@@ -72,6 +88,9 @@ impl std::fmt::Display for Format {
             Format::InstantNgp => "instant-ngp transforms.json",
             Format::Neuralangelo => "Neuralangelo transforms.json",
             Format::Blender => "Blender transforms_train.json",
+            Format::Sdfstudio => "sdfstudio meta_data.json",
+            Format::Neus => "NeuS cameras_sphere.npz",
+            Format::VisMvsnet => "Vis-MVSNet cams",
         })
     }
 }
@@ -189,6 +208,8 @@ struct Frame {
 enum FrameLens {
     /// Complete.
     Stated(Camera),
+    /// A pinhole's focal lengths and centre, in pixels of the picture as it is: the dataset states no size.
+    Pinhole([f64; 4]),
     /// Keys of a transforms.json; some may have to come from the picture's size.
     Keys(transforms::Intrinsics),
 }
@@ -206,10 +227,11 @@ struct Reading {
     notes: Vec<String>,
     /// What was done to COLMAP's world to make this one.
     world_from_colmap: DMat4,
+    truth_from_world: Option<DMat4>,
 }
 
 impl Scene {
-    /// Opens the dataset at `path`: a directory, a transforms.json, or a COLMAP model's own directory.
+    /// Opens the dataset at `path`: a directory, the file that its layout is known by, or a COLMAP model's own directory.
     ///
     /// Only headers of pictures are read. Errors are [`Error::Input`] with the file, the numbers and what to do, and
     /// [`Error::Config`] for options that make no sense.
@@ -242,6 +264,7 @@ impl Scene {
             views: Vec::with_capacity(frames.len()),
             points: std::mem::take(&mut reading.points),
             region_hint: reading.region_hint.take(),
+            truth_from_world: reading.truth_from_world,
             skipped: std::mem::take(&mut reading.skipped),
             notes: std::mem::take(&mut reading.notes),
             masks: options.masks,
@@ -265,7 +288,7 @@ impl Scene {
                     return Err(Error::input(
                         &reading.file,
                         format!("the mask of {}: {why}", frame.name),
-                        "put the mask there, take its mask_path out of the file, or do without masks (--no-masks)",
+                        "put the mask there, take its mention out of the file, or do without masks (--no-masks)",
                     ));
                 }
                 None => images::find_mask(&scene.root, &image_path),
@@ -310,17 +333,84 @@ impl Scene {
     }
 }
 
-/// Recognises the layout and reads it.
+/// What a dataset is known by.
+enum Layout {
+    /// transforms.json or transforms_train.json
+    Transforms(PathBuf),
+    /// meta_data.json
+    Sdfstudio(PathBuf),
+    /// cameras_sphere.npz or cameras.npz
+    Neus(PathBuf),
+    /// A model's directory.
+    Colmap(PathBuf),
+    /// cams
+    VisMvsnet(PathBuf),
+}
+
+impl Layout {
+    /// Those that are found in the directory `path`; the first is to be read.
+    fn found_in(path: &Path) -> Vec<Layout> {
+        let first = |names: &[&str]| {
+            let mut files = names.iter().map(|name| path.join(name));
+            files.find(|file| file.is_file())
+        };
+        [
+            first(&["transforms.json", "transforms_train.json"]).map(Layout::Transforms),
+            first(&["meta_data.json"]).map(Layout::Sdfstudio),
+            first(&["cameras_sphere.npz", "cameras.npz"]).map(Layout::Neus),
+            colmap::find_model(path).map(Layout::Colmap),
+            mvsnet::find_cameras(path).map(Layout::VisMvsnet),
+        ]
+        .into_iter()
+        .flatten()
+        .collect()
+    }
+
+    /// The layout that is known by this file.
+    fn of_file(file: &Path) -> Option<Layout> {
+        let name = json::file_name(file);
+        match file.extension()?.to_str()? {
+            "json" if name.starts_with("meta_data") => Some(Layout::Sdfstudio(file.into())),
+            "json" => Some(Layout::Transforms(file.into())),
+            "npz" => Some(Layout::Neus(file.into())),
+            _ => None,
+        }
+    }
+
+    /// Where it is.
+    fn place(&self) -> &Path {
+        match self {
+            Layout::Transforms(place)
+            | Layout::Sdfstudio(place)
+            | Layout::Neus(place)
+            | Layout::Colmap(place)
+            | Layout::VisMvsnet(place) => place,
+        }
+    }
+
+    /// Reads it, for the dataset at `path`.
+    fn read(&self, path: &Path) -> Result<Reading> {
+        match self {
+            Layout::Transforms(file) => transforms::read(file),
+            Layout::Sdfstudio(file) => sdfstudio::read(file),
+            Layout::Neus(file) => neus::read(file),
+            Layout::Colmap(model) => colmap::read(path, model),
+            Layout::VisMvsnet(cameras) => mvsnet::read(path, cameras),
+        }
+    }
+}
+
+/// Recognises the layout and reads it. Of several, the others are said to be left out; a COLMAP model may still give its points.
 fn read(path: &Path) -> Result<Reading> {
     if path.is_file() {
-        return match path.extension().and_then(|extension| extension.to_str()) {
-            Some("json") => transforms::read(path),
-            _ => Err(Error::input(
+        let layout = Layout::of_file(path).ok_or_else(|| {
+            Error::input(
                 path,
-                "is a file, but neither a directory nor a transforms.json",
+                "is a file, but neither a directory nor a transforms.json, meta_data.json or cameras_sphere.npz",
                 "give the dataset's directory",
-            )),
-        };
+            )
+        })?;
+        return layout.read(path);
     }
     if !path.is_dir() {
         return Err(Error::input(
@@ -329,21 +419,23 @@ fn read(path: &Path) -> Result<Reading> {
             "check the path of the dataset",
         ));
     }
-    let json = ["transforms.json", "transforms_train.json"]
-        .into_iter()
-        .map(|name| path.join(name))
-        .find(|file| file.is_file());
-    let model = colmap::find_model(path);
-    match (json, model) {
-        (Some(json), None) => transforms::read(&json),
-        (None, Some(model)) => colmap::read(path, &model),
-        (Some(json), Some(model)) => {
-            let mut reading = transforms::read(&json)?;
-            colmap::adopt_points(&mut reading, &model);
-            Ok(reading)
+    let layouts = Layout::found_in(path);
+    let (layout, others) = layouts.split_first().ok_or_else(|| unrecognised(path))?;
+    let mut reading = layout.read(path)?;
+    for other in others {
+        if let Layout::Colmap(model) = other {
+            colmap::adopt_points(&mut reading, model);
+        } else {
+            reading.skipped.push(Skipped {
+                what: other.place().display().to_string(),
+                why: format!(
+                    "{} is used; move that away to use this",
+                    json::file_name(&reading.file)
+                ),
+            });
         }
-        (None, None) => Err(unrecognised(path)),
     }
+    Ok(reading)
 }
 
 /// The error for a directory that holds no dataset that can be read: names what is there.
@@ -357,22 +449,6 @@ fn unrecognised(path: &Path) -> Error {
         })
         .unwrap_or_default();
     names.sort();
-    let known = [
-        ("meta_data.json", "an sdfstudio"),
-        ("cameras_sphere.npz", "a NeuS/DTU"),
-        ("cameras.npz", "a NeuS/DTU"),
-        ("cams", "a Vis-MVSNet"),
-    ];
-    if let Some((name, layout)) = known
-        .into_iter()
-        .find(|(name, _)| names.iter().any(|there| there == name))
-    {
-        return Error::input(
-            path,
-            format!("{name} says that this is {layout} dataset, a layout that is not read"),
-            "convert it to transforms.json or a COLMAP model",
-        );
-    }
     let mut there = names.iter().take(8).cloned().collect::<Vec<_>>().join(", ");
     if names.len() > 8 {
         there += &format!(" and {} more", names.len() - 8);
@@ -380,8 +456,9 @@ fn unrecognised(path: &Path) -> Error {
     Error::input(
         path,
         format!(
-            "no dataset here: neither transforms.json, transforms_train.json, nor a COLMAP model (cameras, images and points3D as .bin \
-             or .txt) in sparse/0, sparse, colmap/sparse/0 or the directory itself; it holds {}",
+            "no dataset here: neither transforms.json, transforms_train.json, meta_data.json, cameras_sphere.npz, cams/*_cam.txt, nor a \
+             COLMAP model (cameras, images and points3D as .bin or .txt) in sparse/0, sparse, colmap/sparse/0 or the directory itself; \
+             it holds {}",
             if names.is_empty() {
                 "nothing".into()
             } else {
@@ -444,15 +521,17 @@ fn frame_camera(
     resized: &mut Vec<String>,
 ) -> Result<Camera> {
     let stored = (header.width, header.height);
+    let wrong_lens = |what: String| {
+        let next = "correct the intrinsics and try again";
+        Error::input(file, format!("{}: {what}", frame.name), next)
+    };
     let camera = match &frame.lens {
         FrameLens::Stated(camera) => camera.clone(),
-        FrameLens::Keys(keys) => keys.camera(stored).map_err(|what| {
-            Error::input(
-                file,
-                format!("{}: {what}", frame.name),
-                "correct the intrinsics and try again",
-            )
-        })?,
+        FrameLens::Pinhole(lengths) => {
+            let params = lengths.to_vec();
+            Camera::new(CameraModel::Pinhole, stored.0, stored.1, params).map_err(wrong_lens)?
+        }
+        FrameLens::Keys(keys) => keys.camera(stored).map_err(wrong_lens)?,
     };
     let Some((width, height)) = header.stored_or_turned_for(&camera) else {
         return Err(Error::input(

@@ -10,19 +10,13 @@ use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 
 use glam::{DMat4, DVec3};
-use serde_json::{Map, Value};
+use serde_json::Value;
 
+use super::json::{Document, ENDINGS, brief, file_name, find};
 use super::{Format, Frame, FrameLens, Reading, RegionHint, Skipped, Split, points};
-use crate::{Error, Result};
+use crate::Result;
 
 pub(super) use intrinsics::Intrinsics;
-
-type Object = Map<String, Value>;
-
-/// Endings tried where a path has none, or another one.
-const ENDINGS: [&str; 10] = [
-    "png", "jpg", "jpeg", "JPG", "JPEG", "PNG", "exr", "tif", "tiff", "TIF",
-];
 
 /// instant-ngp's defaults for `scale` and `offset`.
 const NGP_SCALE: f64 = 0.33;
@@ -43,6 +37,7 @@ pub(super) fn read(file: &Path) -> Result<Reading> {
         skipped: Vec::new(),
         notes: Vec::new(),
         world_from_colmap: document.applied_transform()?,
+        truth_from_world: None,
         file: file.to_path_buf(),
         root,
     };
@@ -116,43 +111,7 @@ fn read_held_out(reading: &mut Reading) -> Result<()> {
     Ok(())
 }
 
-/// A parsed file and its path, for errors.
-struct Document<'a> {
-    file: &'a Path,
-    top: Object,
-}
-
-impl<'a> Document<'a> {
-    fn open(file: &'a Path) -> Result<Self> {
-        let data = std::fs::read(file).map_err(|source| Error::io(file, source))?;
-        let text = String::from_utf8_lossy(&data);
-        let text = text.trim_start_matches('\u{feff}');
-        let parsed = serde_json::from_str(text)
-            // Python writes NaN and Infinity, which JSON has not: as null they are found where they matter, with their key.
-            .or_else(|error| serde_json::from_str(&without_bare_words(text)).map_err(|_| error));
-        match parsed {
-            Ok(Value::Object(top)) => Ok(Document { file, top }),
-            Ok(_) => Err(Error::input(
-                file,
-                "holds no object at its top",
-                "export the poses again",
-            )),
-            Err(error) => Err(Error::input(
-                file,
-                format!("is no JSON: {error} ({} bytes)", data.len()),
-                "the file is truncated or was edited by hand: export the poses again",
-            )),
-        }
-    }
-
-    fn error(&self, what: impl Into<String>) -> Error {
-        Error::input(
-            self.file,
-            what,
-            "correct the file, or export the poses again",
-        )
-    }
-
+impl Document<'_> {
     fn format(&self, blender: bool) -> Format {
         let has = |key: &str| self.top.contains_key(key);
         if has("sphere_center") {
@@ -167,44 +126,6 @@ impl<'a> Document<'a> {
         } else {
             Format::Nerfstudio
         }
-    }
-
-    /// A number under `key`; `place` says whose it is. Null counts as absent.
-    fn number(&self, object: &Object, key: &str, place: &str) -> Result<Option<f64>> {
-        match object.get(key) {
-            None | Some(Value::Null) => Ok(None),
-            Some(value) => match value.as_f64() {
-                Some(number) => Ok(Some(number)),
-                None => Err(self.error(format!("{place}{key} is {}, not a number", brief(value)))),
-            },
-        }
-    }
-
-    fn text(&self, key: &str) -> Result<Option<&str>> {
-        match self.top.get(key) {
-            None | Some(Value::Null) => Ok(None),
-            Some(Value::String(text)) => Ok(Some(text)),
-            Some(value) => Err(self.error(format!("{key} is {}, not a path", brief(value)))),
-        }
-    }
-
-    /// `N` finite numbers under `key`.
-    fn vector<const N: usize>(&self, key: &str) -> Result<Option<[f64; N]>> {
-        let Some(value) = self.top.get(key).filter(|value| !value.is_null()) else {
-            return Ok(None);
-        };
-        let mut vector = [0.0; N];
-        let entries = value.as_array().filter(|entries| entries.len() == N);
-        let whole = entries.is_some_and(|entries| {
-            vector.iter_mut().zip(entries).all(|(slot, entry)| {
-                *slot = entry.as_f64().unwrap_or(f64::NAN);
-                slot.is_finite()
-            })
-        });
-        if !whole {
-            return Err(self.error(format!("{key} is {}, not {N} numbers", brief(value))));
-        }
-        Ok(Some(vector))
     }
 
     /// The frames, in the file's order.
@@ -234,53 +155,12 @@ impl<'a> Document<'a> {
                 image: find(root, path, &ENDINGS),
                 mask,
                 lens: FrameLens::Keys(self.intrinsics(entry, &place)?),
-                world_from_camera: self.pose(matrix, &place)?,
+                world_from_camera: self.pose(matrix, "transform_matrix", &place)?,
                 split: None,
                 name,
             });
         }
         Ok(frames)
-    }
-
-    fn pose(&self, value: &Value, place: &str) -> Result<DMat4> {
-        let matrix = self
-            .matrix(value)
-            .map_err(|what| self.error(format!("{place}transform_matrix {what}")))?;
-        super::rigid(matrix).map_err(|what| {
-            let next = "take this frame out of the file, or export the poses again";
-            Error::input(self.file, format!("{place}{what}"), next)
-        })
-    }
-
-    /// Three or four rows of four numbers.
-    fn matrix(&self, value: &Value) -> std::result::Result<DMat4, String> {
-        let rows = value.as_array().map(Vec::as_slice).unwrap_or_default();
-        if rows.len() != 3 && rows.len() != 4 {
-            return Err(format!("is {}, not a 4x4 matrix", brief(value)));
-        }
-        let mut matrix = DMat4::IDENTITY;
-        for (row, entries) in rows.iter().enumerate() {
-            let entries = entries.as_array().filter(|entries| entries.len() == 4);
-            let entries =
-                entries.ok_or_else(|| format!("has a row {row} that is not 4 numbers"))?;
-            for (column, entry) in entries.iter().enumerate() {
-                // Null is what NaN and Infinity were read as.
-                let number = if entry.is_null() {
-                    Some(f64::NAN)
-                } else {
-                    entry.as_f64()
-                };
-                let number = number
-                    .ok_or_else(|| format!("has {} in row {row}, column {column}", brief(entry)))?;
-                if !number.is_finite() {
-                    return Err(format!("has NaN or infinity in row {row}, column {column}"));
-                }
-                if row < 3 {
-                    matrix.col_mut(column)[row] = number;
-                }
-            }
-        }
-        Ok(matrix)
     }
 
     /// nerfstudio: what was done to COLMAP's world on the way into this file.
@@ -404,78 +284,4 @@ impl<'a> Document<'a> {
         }
         Ok(None)
     }
-}
-
-/// The file that `path` means: as it is (with either slash), with another ending, or by its last parts below `root`.
-fn find(root: &Path, path: &str, endings: &[&str]) -> std::result::Result<PathBuf, String> {
-    let path = path.replace('\\', "/");
-    let parts: Vec<&str> = path
-        .split('/')
-        .filter(|part| !part.is_empty() && *part != ".")
-        .collect();
-    let stated = root.join(&path);
-    let shorter = (1..parts.len()).map(|from| root.join(parts[from..].join("/")));
-    let in_images = parts.last().map(|name| root.join("images").join(name));
-    for candidate in std::iter::once(stated.clone())
-        .chain(shorter)
-        .chain(in_images)
-    {
-        if candidate.is_file() {
-            return Ok(candidate);
-        }
-        let appended = |ending: &&str| PathBuf::from(format!("{}.{ending}", candidate.display()));
-        let replaced = |ending: &&str| candidate.with_extension(ending);
-        let named = candidate.file_name().is_some();
-        if let Some(found) = endings
-            .iter()
-            .map(appended)
-            .chain(endings.iter().map(replaced))
-            .find(|other| named && other.is_file())
-        {
-            return Ok(found);
-        }
-    }
-    Err(format!("no such file: {}", stated.display()))
-}
-
-/// `text` with NaN, Infinity and -Infinity outside of strings replaced by null.
-fn without_bare_words(text: &str) -> String {
-    let mut cleaned = String::with_capacity(text.len());
-    let (mut in_string, mut escaped) = (false, false);
-    let mut rest = text;
-    while let Some(character) = rest.chars().next() {
-        let bare = ["NaN", "-Infinity", "Infinity", "nan", "-inf", "inf"]
-            .into_iter()
-            .find(|word| !in_string && rest.starts_with(word));
-        if let Some(word) = bare {
-            cleaned.push_str("null");
-            rest = &rest[word.len()..];
-            continue;
-        }
-        in_string = match (character, in_string, escaped) {
-            ('"', true, true) => true,
-            ('"', _, _) => !in_string,
-            _ => in_string,
-        };
-        escaped = in_string && character == '\\' && !escaped;
-        cleaned.push(character);
-        rest = &rest[character.len_utf8()..];
-    }
-    cleaned
-}
-
-/// A JSON value, short enough for an error.
-fn brief(value: &Value) -> String {
-    let text = value.to_string();
-    match text.char_indices().nth(40) {
-        Some((end, _)) => format!("{}...", &text[..end]),
-        None => text,
-    }
-}
-
-fn file_name(path: &Path) -> String {
-    path.file_name()
-        .unwrap_or(path.as_os_str())
-        .to_string_lossy()
-        .into_owned()
 }

@@ -543,6 +543,57 @@ fn a_run_from_photographs_to_mesh() {
     assert!(trace["traceEvents"].as_array().unwrap().len() > 30);
 }
 
+/// Without a preset the dataset chooses; with another one it is taken as it is, and what speaks against it is said.
+#[test]
+fn presets_are_suggested_and_contradicted() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name).to_str().unwrap().to_string();
+    let (photos, out) = (path("photos"), path("run"));
+    write_dataset(Path::new(&photos));
+    let inspected = run(&["inspect", &photos, "--json"]);
+    assert_eq!(inspected.code, Some(0), "{}", inspected.stderr);
+    let report: Value = serde_json::from_str(&inspected.stdout).unwrap();
+    assert_eq!(report["suggested"]["preset"], "outdoor-tiny");
+    assert_eq!(report["suggested"]["settings"][0], "background.kind=field");
+    assert_eq!(report["beyond"]["runs_on"], true);
+    let text = run(&["inspect", &photos]).stderr;
+    assert!(
+        text.contains("--preset outdoor-tiny --set background.kind=field"),
+        "{text}"
+    );
+
+    let dry = |more: &[&str]| {
+        let words = [
+            &["train", &photos, "--out", &out, "--dry-run", "--json"],
+            &SMALL[..],
+            more,
+        ];
+        let said = run(&words.concat());
+        assert_eq!(said.code, Some(0), "{}", said.stderr);
+        let result: Value = serde_json::from_str(&said.stdout).unwrap();
+        (result["config"].clone(), said.stderr)
+    };
+    let (config, stderr) = dry(&[]);
+    assert_eq!(config["preset"], "outdoor-tiny");
+    assert_eq!(config["background"]["kind"], "field");
+    assert!(
+        stderr.contains("look inwards") && !stderr.contains("warning"),
+        "{stderr}"
+    );
+    let (config, stderr) = dry(&["--preset", "indoor-tiny"]);
+    assert_eq!(config["preset"], "indoor-tiny");
+    assert!(
+        stderr.contains("warning") && stderr.contains("for rooms") && stderr.contains("inwards"),
+        "{stderr}"
+    );
+    let (config, stderr) = dry(&["--preset", "outdoor-tiny"]);
+    assert_eq!(config["background"]["kind"], "constant");
+    assert!(
+        stderr.contains("warning") && stderr.contains("--set background.kind=field"),
+        "{stderr}"
+    );
+}
+
 /// The first interrupt saves and exits 130, and the run goes on from exactly there.
 #[test]
 #[cfg(unix)]

@@ -22,8 +22,7 @@ fn what_is_no_dataset_says_what_is_there() {
     dataset.refuses(&["no dataset here", "it holds nothing"]);
     dataset.write("holiday.txt", "sun");
     dataset.refuses(&["holiday.txt", "transforms.json", "sparse/0"]);
-    dataset.write("meta_data.json", "{}");
-    dataset.refuses(&["sdfstudio", "convert"]);
+    dataset.refuses(&["meta_data.json", "cameras_sphere.npz", "cams/*_cam.txt"]);
     refused(
         Scene::open(Path::new("/no/such/place"), &all_views()),
         &["/no/such/place", "does not exist"],

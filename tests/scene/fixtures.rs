@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use glam::{DMat3, DMat4, DQuat, DVec2, DVec3, DVec4};
 use neurodin::Error;
 use neurodin::scene::{Scene, SceneOptions};
+use npyz::WriterBuilder;
 use serde_json::{Map, Value, json};
 use tempfile::TempDir;
 
@@ -31,6 +32,22 @@ pub fn look_at(eye: DVec3, target: DVec3) -> DMat4 {
         back.extend(0.0),
         eye.extend(1.0),
     )
+}
+
+/// A matrix by rows.
+pub fn rows(matrix: DMat4) -> Vec<[f64; 4]> {
+    (0..4).map(|row| matrix.row(row).to_array()).collect()
+}
+
+/// Writes named arrays of these shapes.
+pub fn write_npz(path: &Path, arrays: &[(String, Vec<u64>, Vec<f64>)]) {
+    let mut npz = npyz::npz::NpzWriter::create(path).unwrap();
+    for (name, shape, values) in arrays {
+        let builder = npz.array(name, Default::default()).unwrap();
+        let mut writer = builder.default_dtype().shape(shape).begin_nd().unwrap();
+        writer.extend(values).unwrap();
+        writer.finish().unwrap();
+    }
 }
 
 /// Points evenly on the sphere of `radius` about `center`.
@@ -211,10 +228,7 @@ impl Rig {
 
     /// The frames of a transforms.json, with what `path` makes of a view's name.
     pub fn frames(&self, path: impl Fn(&str) -> String) -> Vec<Value> {
-        let frame = |(name, pose): &(String, DMat4)| {
-            let rows: Vec<[f64; 4]> = (0..4).map(|row| pose.row(row).to_array()).collect();
-            json!({"file_path": path(name), "transform_matrix": rows})
-        };
+        let frame = |(name, pose): &(String, DMat4)| json!({"file_path": path(name), "transform_matrix": rows(*pose)});
         self.views.iter().map(frame).collect()
     }
 
@@ -236,6 +250,106 @@ impl Rig {
             self.frames(|name| format!("images/{name}.png")).into(),
         );
         Value::Object(top)
+    }
+
+    /// Pose of view `index` with OpenCV's camera axes.
+    pub fn opencv_pose(&self, index: usize) -> DMat4 {
+        self.views[index].1 * DMat4::from_diagonal(DVec4::new(1.0, -1.0, -1.0, 1.0))
+    }
+
+    /// An sdfstudio meta_data.json with these further top-level keys and frames at `name_rgb.png`.
+    pub fn meta_data(&self, extra: Value) -> Value {
+        let frame = |index: usize| {
+            let intrinsics = [
+                [self.focal.x, 0.0, self.center.x, 0.0],
+                [0.0, self.focal.y, self.center.y, 0.0],
+                [0.0, 0.0, 1.0, 0.0],
+                [0.0, 0.0, 0.0, 1.0],
+            ];
+            json!({
+                "rgb_path": format!("{}_rgb.png", self.views[index].0),
+                "camtoworld": rows(self.opencv_pose(index)),
+                "intrinsics": intrinsics,
+            })
+        };
+        let frames: Vec<Value> = (0..self.views.len()).map(frame).collect();
+        let mut top = json!({
+            "camera_model": "OPENCV", "height": self.height, "width": self.width, "frames": frames,
+        });
+        top.as_object_mut()
+            .unwrap()
+            .extend(extra.as_object().unwrap().clone());
+        top
+    }
+
+    /// A dataset with pictures and this meta_data.json.
+    pub fn sdfstudio(&self, meta_data: &Value) -> Dataset {
+        let dataset = Dataset::new();
+        for (index, (name, _)) in self.views.iter().enumerate() {
+            let file = dataset.at(&format!("{name}_rgb.png"));
+            self.picture(index).save(file).unwrap();
+        }
+        dataset.write("meta_data.json", meta_data.to_string());
+        dataset
+    }
+
+    /// `world_mat` of view `index`: K [R | t], where the centre of the first pixel is (0, 0).
+    pub fn world_mat(&self, index: usize) -> DMat4 {
+        let (f, c) = (self.focal, self.center - 0.5);
+        let k = DMat4::from_cols(
+            DVec4::new(f.x, 0.0, 0.0, 0.0),
+            DVec4::new(0.0, f.y, 0.0, 0.0),
+            DVec4::new(c.x, c.y, 1.0, 0.0),
+            DVec4::W,
+        );
+        k * self.opencv_pose(index).inverse()
+    }
+
+    /// A NeuS dataset: pictures, and `world_mat`s with the sphere of this centre and radius. A projection is known up to a factor, of
+    /// either sign: some have one.
+    pub fn neus(&self, center: DVec3, radius: f64) -> Dataset {
+        let dataset = Dataset::new();
+        self.write_pictures(&dataset.at("image"));
+        let scale = DMat4::from_translation(center) * DMat4::from_scale(DVec3::splat(radius));
+        let mut arrays = Vec::new();
+        for index in 0..self.views.len() {
+            let factor = [1.0, -2.5, 0.25][index % 3];
+            let world = rows(self.world_mat(index) * factor).concat();
+            arrays.push((format!("world_mat_{index}"), vec![4, 4], world));
+            arrays.push((
+                format!("scale_mat_{index}"),
+                vec![4, 4],
+                rows(scale).concat(),
+            ));
+        }
+        write_npz(&dataset.at("cameras_sphere.npz"), &arrays);
+        dataset
+    }
+
+    /// A Vis-MVSNet dataset. Views need names that are numbers.
+    pub fn mvsnet(&self) -> Dataset {
+        let dataset = Dataset::new();
+        self.write_pictures(&dataset.at("images"));
+        for (index, (name, _)) in self.views.iter().enumerate() {
+            dataset.write(&format!("cams/{name}_cam.txt"), self.cam(index));
+        }
+        dataset
+    }
+
+    /// The text of a cam file.
+    pub fn cam(&self, index: usize) -> String {
+        let line = |row: &[f64]| {
+            let numbers: Vec<String> = row.iter().map(f64::to_string).collect();
+            numbers.join(" ") + "\n"
+        };
+        let mut text = String::from("extrinsic\n");
+        let camera_from_world = self.opencv_pose(index).inverse();
+        (0..4).for_each(|row| text += &line(&camera_from_world.row(row).to_array()));
+        text += "\nintrinsic\n";
+        text += &line(&[self.focal.x, 0.0, self.center.x]);
+        text += &line(&[0.0, self.focal.y, self.center.y]);
+        text += &line(&[0.0, 0.0, 1.0]);
+        text + "\n0.5 0.01 192 8.5\n"
     }
 
     /// A dataset with pictures and `transforms`.

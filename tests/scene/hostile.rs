@@ -2,6 +2,7 @@
 
 use std::fs;
 
+use glam::DVec3;
 use proptest::prelude::*;
 use serde_json::json;
 
@@ -63,6 +64,35 @@ proptest! {
         }));
         let dataset = rig.dataset(&whole);
         dataset.write("transforms.json", damage(whole.to_string().as_bytes(), &edits));
+        exercise(&dataset);
+    }
+
+    #[test]
+    fn damaged_meta_data(edits in edits()) {
+        let rig = Rig::skewed(3);
+        let whole = rig.meta_data(json!({
+            "scene_box": {"aabb": [[-1, -1, -1], [1, 1, 1]], "near": 0.05, "far": 2.5, "radius": 1.0, "collider_type": "sphere"},
+            "worldtogt": [[2, 0, 0, 1], [0, 2, 0, 2], [0, 0, 2, 3], [0, 0, 0, 1]],
+        }));
+        let dataset = rig.sdfstudio(&whole);
+        dataset.write("meta_data.json", damage(whole.to_string().as_bytes(), &edits));
+        exercise(&dataset);
+    }
+
+    #[test]
+    fn damaged_neus_archives(edits in edits()) {
+        let dataset = Rig::skewed(3).neus(DVec3::ONE, 2.0);
+        let whole = fs::read(dataset.at("cameras_sphere.npz")).unwrap();
+        dataset.write("cameras_sphere.npz", damage(&whole, &edits));
+        exercise(&dataset);
+    }
+
+    #[test]
+    fn damaged_cams(edits in edits()) {
+        let mut rig = Rig::skewed(3);
+        rig.views.iter_mut().enumerate().for_each(|(index, view)| view.0 = index.to_string());
+        let dataset = rig.mvsnet();
+        dataset.write("cams/1_cam.txt", damage(rig.cam(1).as_bytes(), &edits));
         exercise(&dataset);
     }
 

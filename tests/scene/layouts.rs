@@ -4,9 +4,10 @@ use std::fs;
 
 use glam::{DMat4, DVec2, DVec3};
 use neurodin::scene::{CameraModel, Format, Scene, SceneOptions, Split};
+use npyz::WriterBuilder;
 use serde_json::json;
 
-use crate::fixtures::{Dataset, Rig, all_views, assert_rays};
+use crate::fixtures::{Dataset, Rig, all_views, assert_rays, rows};
 
 #[test]
 fn colmap_text_and_binary_give_the_rays() {
@@ -53,6 +54,148 @@ fn transforms_dialects_give_the_rays() {
         assert_eq!(scene.format, format);
         assert_rays(&rig, &scene);
     }
+}
+
+#[test]
+fn one_rig_in_every_layout_gives_the_same_rays() {
+    let mut rig = Rig::skewed(7);
+    for (index, (name, _)) in rig.views.iter_mut().enumerate() {
+        *name = format!("{index:08}");
+    }
+    let colmap = Dataset::new();
+    rig.write_pictures(&colmap.at("images"));
+    rig.write_colmap_binary(&colmap.at("sparse/0"));
+    let ngp = json!({"aabb_scale": 4, "scale": 0.33, "offset": [0.5, 0.5, 0.5]});
+    let neuralangelo = json!({"sphere_center": [1.0, 2.0, 0.5], "sphere_radius": 1.5});
+    let layouts = [
+        (Format::Colmap, colmap),
+        (Format::Nerfstudio, rig.dataset(&rig.transforms(json!({})))),
+        (Format::InstantNgp, rig.dataset(&rig.transforms(ngp))),
+        (
+            Format::Neuralangelo,
+            rig.dataset(&rig.transforms(neuralangelo)),
+        ),
+        (Format::Sdfstudio, rig.sdfstudio(&rig.meta_data(json!({})))),
+        (Format::Neus, rig.neus(DVec3::new(1.0, 2.0, 0.5), 1.5)),
+        (Format::VisMvsnet, rig.mvsnet()),
+    ];
+    for (format, dataset) in layouts {
+        let scene = dataset.open().unwrap();
+        assert_eq!(scene.format, format);
+        assert_rays(&rig, &scene);
+    }
+}
+
+#[test]
+fn sdfstudio_intrinsics_may_be_small_and_refer_to_another_size() {
+    let rig = Rig::skewed(4);
+    let mut meta_data = rig.meta_data(json!({"width": 128, "height": 96, "has_mono_prior": true}));
+    for frame in meta_data["frames"].as_array_mut().unwrap() {
+        let [f, c] = [rig.focal * 2.0, rig.center * 2.0];
+        frame["intrinsics"] = json!([[f.x, 0.0, c.x], [0.0, f.y, c.y], [0.0, 0.0, 1.0]]);
+        frame["mono_depth_path"] = json!("depth.npy");
+    }
+    let scene = rig.sdfstudio(&meta_data).open().unwrap();
+    assert_rays(&rig, &scene);
+    let notes = scene.notes.join("\n");
+    assert!(
+        notes.contains("mono_depth_path of 4 frames") && notes.contains("128x96"),
+        "{notes}"
+    );
+
+    // Without a size, lengths are in pixels of the picture.
+    let mut meta_data = rig.meta_data(json!({}));
+    meta_data.as_object_mut().unwrap().remove("width");
+    meta_data.as_object_mut().unwrap().remove("height");
+    assert_rays(&rig, &rig.sdfstudio(&meta_data).open().unwrap());
+}
+
+#[test]
+fn an_sdfstudio_scene_knows_the_way_into_the_frame_of_the_truth() {
+    // As sdfstudio makes it: the dataset is the world moved and scaled into a box, worldtogt the way back.
+    let truth = Rig::skewed(6);
+    let world_from_truth = DMat4::from_scale(DVec3::splat(0.125))
+        * DMat4::from_translation(DVec3::new(-1.0, 2.0, 0.3));
+    let mut rig = truth.clone();
+    for (_, pose) in &mut rig.views {
+        let position = world_from_truth.transform_point3(pose.w_axis.truncate());
+        pose.w_axis = position.extend(1.0);
+    }
+    let meta_data = rig.meta_data(json!({"worldtogt": rows(world_from_truth.inverse())}));
+    let dataset = rig.sdfstudio(&meta_data);
+    let scene = dataset.open().unwrap();
+    let back = scene.truth_from_world.unwrap();
+    for (view, (_, pose)) in scene.views.iter().zip(&truth.views) {
+        let position = back.transform_point3(view.position());
+        assert!((position - pose.w_axis.truncate()).length() < 1e-9);
+    }
+    // A COLMAP model in the truth's frame gives its points, in the frame of the dataset's cameras.
+    let mut colmap = truth.clone();
+    for (name, _) in &mut colmap.views {
+        *name += "_rgb";
+    }
+    colmap.write_colmap_binary(&dataset.at("colmap"));
+    let scene = dataset.open().unwrap();
+    assert_eq!(scene.points.len(), truth.points.len());
+    let wanted = world_from_truth.transform_point3(truth.points[9]);
+    assert!((scene.points[9].position - wanted).length() < 1e-9);
+}
+
+#[test]
+fn neus_masks_belong_to_pictures_by_order_and_float32_is_enough() {
+    let rig = Rig::skewed(5);
+    let dataset = rig.neus(DVec3::ZERO, 1.0);
+    fs::create_dir(dataset.at("mask")).unwrap();
+    for index in 0..5u8 {
+        let mask = image::GrayImage::from_pixel(rig.width, rig.height, image::Luma([index * 60]));
+        mask.save(dataset.at(&format!("mask/{index:03}.png")))
+            .unwrap();
+    }
+    let scene = dataset.open().unwrap();
+    for (index, view) in scene.views.iter().enumerate() {
+        let mask = view.mask_path.as_ref().unwrap();
+        assert!(mask.ends_with(format!("mask/{index:03}.png")), "{mask:?}");
+    }
+    let picture = scene.load_picture(2).unwrap();
+    assert!(picture.rgba.chunks(4).all(|pixel| pixel[3] == 120));
+
+    // IDR's name, in single precision as its files are, and stored by columns.
+    fs::remove_file(dataset.at("cameras_sphere.npz")).unwrap();
+    let mut npz = npyz::npz::NpzWriter::create(dataset.at("cameras.npz")).unwrap();
+    for index in 0..5 {
+        let builder = npz
+            .array(&format!("world_mat_{index}"), Default::default())
+            .unwrap();
+        let builder = builder.default_dtype().order(npyz::Order::Fortran);
+        let mut writer = builder.shape(&[4, 4]).begin_nd().unwrap();
+        let columns = rig.world_mat(index).to_cols_array();
+        writer.extend(columns.map(|x| x as f32)).unwrap();
+        writer.finish().unwrap();
+    }
+    drop(npz);
+    let scene = dataset.open().unwrap();
+    assert!(scene.region_hint.is_none());
+    assert_rays(&rig, &scene);
+}
+
+#[test]
+fn of_several_layouts_one_is_read_and_the_others_are_said() {
+    let rig = Rig::skewed(4);
+    let dataset = rig.dataset(&rig.transforms(json!({})));
+    dataset.write("meta_data.json", "{}");
+    dataset.write("cams/00000000_cam.txt", "");
+    let scene = dataset.open().unwrap();
+    assert_eq!(scene.format, Format::Nerfstudio);
+    let skipped: Vec<_> = scene.skipped.iter().map(|skipped| &skipped.what).collect();
+    assert!(
+        skipped[0].ends_with("meta_data.json") && skipped[1].ends_with("cams"),
+        "{skipped:?}"
+    );
+    // Named by its own file, another one is read.
+    let whole = rig.sdfstudio(&rig.meta_data(json!({})));
+    whole.write("transforms.json", "{}");
+    let scene = Scene::open(&whole.at("meta_data.json"), &all_views()).unwrap();
+    assert_eq!(scene.format, Format::Sdfstudio);
 }
 
 #[test]

@@ -4,7 +4,9 @@ use std::collections::HashMap;
 use std::path::PathBuf;
 
 use glam::{DMat4, DVec3};
-use neurodin::scene::{Facing, Format, Looks, Region, RegionOverrides, RegionShape, Scene, Split};
+use neurodin::scene::{
+    Beyond, Facing, Format, Looks, Region, RegionOverrides, RegionShape, Scene, SceneOptions, Split,
+};
 
 use crate::fixtures::all_views;
 
@@ -103,6 +105,31 @@ fn the_region_is_the_stated_one_or_holds_what_it_does() {
             estimated.points_inside(&scene) * 100 >= scene.points.len() * 95,
             "{name}: {estimated:?}"
         );
+    }
+}
+
+#[test]
+fn the_object_stands_before_an_even_backdrop() {
+    let Some(folder) = scene_folder("p1_object") else {
+        return;
+    };
+    for masks in [true, false] {
+        let scene = Scene::open(
+            &folder,
+            &SceneOptions {
+                masks,
+                ..all_views()
+            },
+        )
+        .unwrap();
+        // Its floor ends a little outside of the stated region.
+        let wider = RegionOverrides {
+            scale: 1.5,
+            ..Default::default()
+        };
+        let region = Region::estimate(&scene, &wider).unwrap();
+        let beyond = Beyond::of(&scene, &region).unwrap();
+        assert!(!beyond.runs_on, "{}", beyond.why);
     }
 }
 

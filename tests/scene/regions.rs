@@ -1,7 +1,9 @@
 //! The region: what is stated, what is estimated in spite of outliers, and what the preview shows of it.
 
 use glam::{DVec3, Vec3};
-use neurodin::scene::{Facing, Looks, Region, RegionOverrides, RegionShape, Scene, write_preview};
+use neurodin::scene::{
+    Beyond, Facing, Looks, Region, RegionOverrides, RegionShape, Scene, write_preview,
+};
 use serde_json::{Value, json};
 
 use crate::fixtures::{Dataset, Rig, look_at, sphere};
@@ -133,6 +135,114 @@ fn without_points_cameras_alone_decide() {
     );
     let region = estimate(&scene);
     assert!(region.center.y > region.radius, "{region:?}");
+}
+
+#[test]
+fn what_lies_beyond_the_region_is_told_by_pixels_and_points() {
+    let mut rig = Rig::around_a_ball(8);
+    let middle = DVec3::new(1.0, 2.0, 0.5);
+    let beyond = |rig: &Rig, radius: f64, backdrop: Option<[u8; 3]>| {
+        let (dataset, mut scene) = colmap_scene(rig);
+        if let Some(backdrop) = backdrop {
+            // A dotted ball before one colour, with a little noise; its outline leaks out of the region.
+            let ball = Region {
+                center: middle,
+                radius: 1.05,
+                shape: RegionShape::Sphere,
+                how: String::new(),
+            };
+            for view in &scene.views {
+                let picture = image::RgbImage::from_fn(rig.width, rig.height, |x, y| {
+                    let pixel = glam::DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5);
+                    let (origin, direction) = view.ray(pixel);
+                    let nearest = origin + direction * (ball.center - origin).dot(direction);
+                    image::Rgb(match ball.contains(nearest) {
+                        true => [(x * 40 % 256) as u8, (y * 70 % 256) as u8, 9],
+                        false => backdrop.map(|channel| channel + ((x + 2 * y) % 5) as u8),
+                    })
+                });
+                picture.save(&view.image_path).unwrap();
+            }
+            scene = dataset.open().unwrap();
+        }
+        let region = Region {
+            center: middle,
+            radius,
+            shape: RegionShape::Sphere,
+            how: String::new(),
+        };
+        Beyond::of(&scene, &region).unwrap()
+    };
+    let even = beyond(&rig, 1.02, Some([90, 140, 200]));
+    assert!(!even.runs_on, "{}", even.why);
+    assert!(even.why.contains("(92, 142, 202)"), "{}", even.why);
+    let uneven = beyond(&rig, 1.02, None);
+    assert!(
+        uneven.runs_on && uneven.why.contains("median colour"),
+        "{}",
+        uneven.why
+    );
+    // A region that fills the pictures: points decide, and without them the worse is supposed.
+    let filled = beyond(&rig, 3.9, None);
+    assert!(
+        !filled.runs_on && filled.why.contains("100 %"),
+        "{}",
+        filled.why
+    );
+    rig.points.extend(sphere(100, middle, 9.0));
+    let ground = beyond(&rig, 1.02, Some([90, 140, 200]));
+    assert!(
+        ground.runs_on && ground.why.contains("20 % of the sparse"),
+        "{}",
+        ground.why
+    );
+    rig.points.clear();
+    let unknown = beyond(&rig, 3.9, None);
+    assert!(
+        unknown.runs_on && unknown.why.contains("no points"),
+        "{}",
+        unknown.why
+    );
+}
+
+#[test]
+fn boxes_and_spheres_of_other_layouts_are_taken() {
+    let rig = Rig::around_a_ball(8);
+    let sdfstudio = |scene_box: Value| {
+        let meta_data = rig.meta_data(json!({"scene_box": scene_box}));
+        estimate(&rig.sdfstudio(&meta_data).open().unwrap())
+    };
+    let region = sdfstudio(json!({
+        "aabb": [[-1, 0, -1], [3, 4, 2]], "near": 0.05, "far": 2.5, "radius": 1.0, "collider_type": "box",
+    }));
+    assert_eq!(
+        (region.center, region.radius),
+        (DVec3::new(1.0, 2.0, 0.5), 2.0)
+    );
+    let half = DVec3::new(1.0, 1.0, 0.75);
+    assert_eq!(region.shape, RegionShape::Box { half });
+    assert!(region.how.contains("scene_box"), "{}", region.how);
+    let region = sdfstudio(
+        json!({"aabb": [[-1, -1, -1], [1, 1, 1]], "radius": 1.5, "collider_type": "sphere"}),
+    );
+    assert_eq!(
+        (region.center, region.radius, region.shape),
+        (DVec3::ZERO, 1.5, RegionShape::Sphere)
+    );
+
+    let center = DVec3::new(1.0, 2.0, 0.5);
+    let scene = rig.neus(center, 1.25).open().unwrap();
+    let region = estimate(&scene);
+    assert_eq!(
+        (region.center, region.radius, region.shape),
+        (center, 1.25, RegionShape::Sphere)
+    );
+    assert!(region.how.contains("scale_mat_0"), "{}", region.how);
+    let other = RegionOverrides {
+        radius: Some(2.0),
+        ..Default::default()
+    };
+    assert_eq!(Region::estimate(&scene, &other).unwrap().radius, 2.0);
 }
 
 #[test]

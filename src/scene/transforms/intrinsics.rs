@@ -2,8 +2,8 @@
 
 use serde_json::Value;
 
+use super::super::json::{Document, Object};
 use super::super::{Camera, CameraModel};
-use super::{Document, Object};
 use crate::{Error, Result};
 
 impl Document<'_> {

@@ -1,0 +1,120 @@
+//! Which preset a dataset asks for, by where its cameras look and what lies beyond the region; and whether another one fits.
+
+use super::scene_args::SceneArgs;
+use super::train::{region_wanted, with_scene_flags};
+use crate::Result;
+use crate::config::{BackgroundKind, Config};
+use crate::scene::{Beyond, Facing, Looks, Region, Scene};
+
+/// What a dataset asks for, and why.
+pub(super) struct Suggestion {
+    pub looks: Looks,
+    /// `None` for rooms, which end at their walls.
+    pub beyond: Option<Beyond>,
+}
+
+impl Suggestion {
+    /// Looks at the cameras, and at a few pictures where they do not stand in a room.
+    ///
+    /// # Errors
+    /// [`crate::Error::Input`] for a picture that cannot be read.
+    pub fn of(scene: &Scene, region: &Region) -> Result<Suggestion> {
+        let looks = Looks::of(scene);
+        let beyond = match looks.facing {
+            Facing::Inward => Some(Beyond::of(scene, region)?),
+            Facing::Outward => None,
+        };
+        Ok(Suggestion { looks, beyond })
+    }
+
+    /// The same with the region that the suggested preset would take.
+    ///
+    /// # Errors
+    /// As [`Suggestion::of`] and [`Region::estimate`].
+    pub fn for_scene(scene: &Scene, flags: &SceneArgs) -> Result<Suggestion> {
+        let config = with_scene_flags(flags, Config::preset("outdoor-tiny")?)?;
+        let region = Region::estimate(scene, &region_wanted(flags, &config))?;
+        Suggestion::of(scene, &region)
+    }
+
+    /// What the names of fitting presets begin with.
+    pub fn kind(&self) -> &'static str {
+        match self.looks.facing {
+            Facing::Inward => "outdoor",
+            Facing::Outward => "indoor",
+        }
+    }
+
+    /// The preset for a software device.
+    pub fn preset(&self) -> String {
+        format!("{}-tiny", self.kind())
+    }
+
+    /// What should differ from it.
+    pub fn settings(&self) -> &'static [&'static str] {
+        match &self.beyond {
+            Some(Beyond { runs_on: true, .. }) => &["background.kind=field"],
+            _ => &[],
+        }
+    }
+
+    /// The preset with those settings.
+    ///
+    /// # Errors
+    /// None that a preset of this program could have.
+    pub fn config(&self) -> Result<Config> {
+        let config = Config::preset(&self.preset())?;
+        self.settings()
+            .iter()
+            .try_fold(config, |config, setting| config.with_assignment(setting))
+    }
+
+    /// Why it was chosen, for a line that names the preset.
+    pub fn in_words(&self) -> String {
+        let kind = match self.looks.facing {
+            Facing::Inward => "inwards",
+            Facing::Outward => "outwards",
+        };
+        let with: Vec<String> = self
+            .settings()
+            .iter()
+            .map(|setting| format!(" with {setting}"))
+            .collect();
+        format!(
+            "{} (the cameras look {kind}{}; --preset chooses another)",
+            with.concat(),
+            match &self.beyond {
+                Some(Beyond { runs_on: true, why }) => format!(", and {why}"),
+                _ => String::new(),
+            }
+        )
+    }
+
+    /// What speaks against a configuration that was asked for. It is used all the same.
+    pub fn doubts(&self, config: &Config) -> Vec<String> {
+        let mut doubts = Vec::new();
+        let room = self.looks.facing == Facing::Outward;
+        if config.surface.inside_out != room {
+            let (meant, looks) = match room {
+                true => ("objects and open scenes", "outwards, as from within a room"),
+                false => ("rooms", "inwards, as at an object or building"),
+            };
+            doubts.push(format!(
+                "{} is for {meant} (surface.inside_out = {}), but the cameras look {looks}: {}. It is used as asked; if the mesh is bad, try {}",
+                config.preset,
+                config.surface.inside_out,
+                self.looks.why,
+                self.preset()
+            ));
+        }
+        if let Some(Beyond { runs_on: true, why }) = &self.beyond
+            && !config.surface.inside_out
+            && config.background.kind != BackgroundKind::Field
+        {
+            doubts.push(format!(
+                "{why}, which one colour behind the region cannot explain: the surface may vanish over it; --set background.kind=field shows what lies beyond"
+            ));
+        }
+        doubts
+    }
+}
