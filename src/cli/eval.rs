@@ -80,12 +80,17 @@ pub struct EvalArgs {
 }
 
 pub(super) fn run(args: &EvalArgs, context: &Context) -> anyhow::Result<()> {
-    let (report, text) = match (&args.run, &args.mesh) {
-        (Some(run), _) => pictures::score(run, args, context)?,
-        (None, Some(mesh)) => score_mesh(args, mesh)?,
-        (None, None) => unreachable!("clap requires one of them"),
-    };
+    let (report, text) = score(args, context)?;
     Ok(context.result(&report, &text)?)
+}
+
+/// Scores what `args` name: the report for programs, and the one for people.
+pub(super) fn score(args: &EvalArgs, context: &Context) -> anyhow::Result<(Value, String)> {
+    match (&args.run, &args.mesh) {
+        (Some(run), _) => pictures::score(run, args, context),
+        (None, Some(mesh)) => Ok(score_mesh(args, mesh)?),
+        (None, None) => unreachable!("clap requires one of them"),
+    }
 }
 
 /// Scores `mesh` against its reference: the report for programs, and the one for people.

@@ -9,7 +9,7 @@ use crate::train::run_directory::RunDirectory;
 use crate::train::trained::Trained;
 use clap::{Args, ValueEnum};
 use glam::{DMat4, DVec3};
-use serde_json::json;
+use serde_json::{Value, json};
 use std::path::PathBuf;
 use std::sync::atomic::Ordering;
 
@@ -63,6 +63,12 @@ pub(super) enum Frame {
 const STEEPEST: f64 = 4.0;
 
 pub(super) fn run(args: &MeshArgs, context: &Context) -> anyhow::Result<()> {
+    let (result, text) = take(args, context)?;
+    Ok(context.result(&result, &text)?)
+}
+
+/// Takes the mesh out as `args` say: what came of it, for programs and for people.
+pub(super) fn take(args: &MeshArgs, context: &Context) -> anyhow::Result<(Value, String)> {
     let run = RunDirectory::open(&args.run)?;
     let out = args
         .out
@@ -129,7 +135,7 @@ pub(super) fn run(args: &MeshArgs, context: &Context) -> anyhow::Result<()> {
         mesh.positions.len(),
         mesh.faces.len()
     );
-    Ok(context.result(&result, &text)?)
+    Ok((result, text))
 }
 
 /// The mesh in region coordinates, with normals and colours.

@@ -1,6 +1,7 @@
 //! The command line: what was typed becomes what is meant; results go to stdout, everything else to stderr.
 
 mod bias;
+mod compare;
 pub mod demo;
 mod devices;
 mod diagnostics;
@@ -124,6 +125,7 @@ enum Command {
     Render(render::RenderArgs),
     Eval(eval::EvalArgs),
     Profile(Box<profile::ProfileArgs>),
+    Compare(Box<compare::CompareArgs>),
     Bias(Box<bias::BiasArgs>),
     Demo(demo::DemoArgs),
 }
@@ -138,6 +140,7 @@ impl Command {
             Command::Render(args) => render::run(args, context),
             Command::Eval(args) => eval::run(args, context),
             Command::Profile(args) => profile::run(args, context),
+            Command::Compare(args) => compare::run(args, context),
             Command::Bias(args) => bias::run(args, context),
             Command::Demo(args) => demo::run(args, context),
         }

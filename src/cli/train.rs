@@ -413,11 +413,13 @@ impl Task {
         }
         let begun = Instant::now();
         let mut steps_done = self.trainer.steps_done();
+        let mut device_bytes = 0;
         let mut trainer = Some(self.trainer);
         let mut outcome = Ok(());
         while let Some(mut stage) = trainer.take() {
             outcome = stage.run(&self.scene, &run, &mut |event| teller.hear(event));
             steps_done = stage.steps_done();
+            device_bytes = device_bytes.max(stage.gpu().memory_plan().total);
             if outcome.is_ok() {
                 match stage.next_stage(&self.scene, &run) {
                     Ok(next) => trainer = next,
@@ -445,6 +447,7 @@ impl Task {
             "run": run.root(),
             "step": steps_done,
             "seconds": seconds.as_secs_f64(),
+            "device_bytes": device_bytes,
             "preview_psnr": psnr,
             "checkpoint": checkpoint,
         });

@@ -313,6 +313,9 @@ impl Trainer {
         annealed(&self.schedule.at(self.step))
     }
 
+    pub fn gpu(&self) -> &Gpu {
+        &self.gpu
+    }
     pub fn model(&self) -> &Model {
         &self.model
     }

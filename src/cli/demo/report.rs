@@ -90,7 +90,7 @@ pub struct KernelRow {
     pub gbytes: Option<f64>,
 }
 
-const STYLE: &str = include_str!("report.css");
+pub const STYLE: &str = include_str!("report.css");
 
 impl Report {
     /// The page.
@@ -388,7 +388,8 @@ pub fn duration(seconds: f64) -> String {
 }
 
 /// An `<img>` that carries its PNG.
-fn image(picture: &Rgb, description: &str) -> String {
+/// The picture within the page itself.
+pub fn image(picture: &Rgb, description: &str) -> String {
     format!(
         "<img width=\"{}\" height=\"{}\" alt=\"{}\" src=\"data:image/png;base64,{}\">",
         picture.width,
