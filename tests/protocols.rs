@@ -12,6 +12,7 @@ use neurodin::eval::cloud::{lattice, thinned};
 use neurodin::eval::tanks;
 use neurodin::mesh::{Mesh, write_mesh};
 use npyz::{Order, WriterBuilder};
+use proptest::prelude::*;
 use serde_json::{Value, json};
 
 /// A repeatable stream of numbers in [0, 1).
@@ -674,4 +675,34 @@ fn masks_planes_and_alignments_of_another_shape_are_refused() {
         "--mesh a.ply --reference a.ply --align meta_data.json",
         &["states no worldtogt"],
     );
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 128, failure_persistence: None, ..ProptestConfig::default() })]
+
+    #[test]
+    fn damaged_files_end_in_scores_or_errors(which in 0usize..4, place: u32, value: u8, cut: bool) {
+        let (mask, low, _) = observation();
+        let files = Files::new();
+        files.points("a.ply", &[low, low + 3.0, low + DVec3::new(0.5, 0.5, 0.2)]);
+        files.write("crop.json", &crop_file(2, [-1.0, 1e4]).to_string());
+        files.write("trans.txt", &as_text(DMat4::IDENTITY));
+        save_observation(&files.path("mask.npz"), &mask, low);
+        save(&files.path("plane.npz"), &[("P", &[4], vec![0.0, 0.0, 1.0, 0.0])]);
+        let damaged = files.path(["crop.json", "trans.txt", "mask.npz", "plane.npz"][which]);
+        let mut bytes = std::fs::read(&damaged).unwrap();
+        let at = place as usize % bytes.len();
+        if cut {
+            bytes.truncate(at);
+        } else {
+            bytes[at] = value;
+        }
+        std::fs::write(&damaged, bytes).unwrap();
+        let mesh = "--mesh a.ply --reference a.ply --align trans.txt --protocol";
+        for words in ["tnt --scene Barn --crop-polygon crop.json", "dtu --observed mask.npz --plane plane.npz"] {
+            if let Err(error) = files.eval(&format!("{mesh} {words}")) {
+                prop_assert!([1, 3].contains(&error.exit_code()), "{error}");
+            }
+        }
+    }
 }

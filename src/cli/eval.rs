@@ -33,8 +33,7 @@ use protocol::{Protocol, ProtocolArgs};
 
 Thresholds, distances and boxes are in the coordinates of the reference, which are those of the mesh or what --align makes of them.
 
-DTU's MATLAB files become .npz by
-  python3 -c \"import sys, numpy, scipy.io; numpy.savez(sys.argv[2], **{k: v for k, v in scipy.io.loadmat(sys.argv[1]).items() if k[0] != '_'})\" IN.mat OUT.npz")]
+DTU's MATLAB files are read as .npz; a .mat file is refused with the line that converts it.")]
 #[command(group = clap::ArgGroup::new("scored").required(true).args(["run", "mesh"]))]
 pub struct EvalArgs {
     /// Run directory: PSNR and SSIM of its held-out views
