@@ -75,3 +75,72 @@ fn bias_of_a_plane_of_a_dataset_and_of_a_run() {
         one.stderr
     );
 }
+
+#[test]
+fn methods_are_compared_and_a_study_goes_on() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name).to_str().unwrap().to_string();
+    let (photos, study, points) = (path("photos"), path("study"), path("points.ply"));
+    write_dataset(Path::new(&photos));
+    write_ball(Path::new(&points));
+    let compare = |methods: &str| {
+        let words = [
+            &["compare", &photos, "--out", &study, "--methods", methods][..],
+            &["--preset", "outdoor-tiny", "--steps", "8", "--seeds", "2"],
+            &["--resolution", "24", "--reference", &points, "--unseen"],
+            &["--thresholds", "0.1,0.3", "--json", "--report"],
+            &[&path("compare.html")],
+            &SMALL[..],
+        ];
+        said(neurodin(&words.concat()).output().unwrap())
+    };
+    let unknown = compare("neurodin,neus");
+    assert_eq!(unknown.code, Some(3), "{}", unknown.stderr);
+    assert!(unknown.stderr.contains("'neus-grid'"), "{}", unknown.stderr);
+
+    let first = compare("neuralangelo");
+    assert_eq!(first.code, Some(0), "{}", first.stderr);
+    let both = compare("neurodin,neuralangelo");
+    assert_eq!(both.code, Some(0), "{}", both.stderr);
+    assert_eq!(both.stderr.matches("done before").count(), 2);
+    let result: Value = serde_json::from_str(&both.stdout).unwrap();
+    for (nth, method) in ["neurodin", "neuralangelo"].into_iter().enumerate() {
+        let row = &result["methods"][nth];
+        assert_eq!(row["method"], method);
+        for column in ["F at 0.300", "PSNR", "s/step", "MiB"] {
+            let cell = &row["means"][column];
+            assert!(
+                cell["mean"].as_f64().is_some_and(|x| x > 0.0),
+                "{column}: {row}"
+            );
+            assert!(cell["spread"].is_f64(), "{column}: {row}");
+        }
+        let run = &row["runs"][1];
+        assert_eq!((&run["seed"], &run["steps"]), (&43.into(), &8.into()));
+    }
+    let before: Value = serde_json::from_str(&first.stdout).unwrap();
+    assert_eq!(before["methods"][0], result["methods"][1]);
+    let page = std::fs::read_to_string(path("compare.html")).unwrap();
+    assert_eq!(page.matches("<figure>").count(), 2, "a mesh of each method");
+
+    let scores = path("study/neurodin-0/scores.json");
+    std::fs::write(&scores, "{}").unwrap();
+    let refused = compare("neurodin");
+    assert_eq!(refused.code, Some(3));
+    assert!(refused.stderr.contains("scores.json"), "{}", refused.stderr);
+}
+
+/// Points all over the unit sphere.
+fn write_ball(path: &Path) {
+    let n = 2000;
+    let mut text = format!(
+        "ply\nformat ascii 1.0\nelement vertex {n}\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
+    );
+    for i in 0..n {
+        let z = 1.0 - (2.0 * f64::from(i) + 1.0) / f64::from(n);
+        let (sin, cos) = (2.399_963 * f64::from(i)).sin_cos();
+        let radius = (1.0 - z * z).sqrt();
+        text += &format!("{} {} {z}\n", radius * cos, radius * sin);
+    }
+    std::fs::write(path, text).unwrap();
+}
