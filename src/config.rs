@@ -191,6 +191,14 @@ pub struct SurfaceConfig {
     pub tap_range: f64,
 }
 
+impl SurfaceConfig {
+    /// Radius of the sphere that the geometric initialisation makes the surface, about, in region units: with it the network is
+    /// 0.85 ‖x‖ + 0.12 − init_bias (measured at init_bias 0.5, METHOD 2.4).
+    pub fn initial_radius(&self) -> f64 {
+        ((self.init_bias - 0.12) / 0.85).max(0.0)
+    }
+}
+
 /// How the gradient of the signed distance is had (METHOD 3).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]

@@ -4,7 +4,7 @@ use super::scene_args::SceneArgs;
 use super::train::{region_wanted, with_scene_flags};
 use crate::Result;
 use crate::config::{BackgroundKind, Config};
-use crate::scene::{Beyond, Facing, Looks, Region, Scene};
+use crate::scene::{Beyond, Facing, Looks, Region, Scene, Split};
 
 /// What a dataset asks for, and why.
 pub(super) struct Suggestion {
@@ -91,8 +91,10 @@ impl Suggestion {
     }
 
     /// What speaks against a configuration that was asked for. It is used all the same.
-    pub fn doubts(&self, config: &Config) -> Vec<String> {
-        let mut doubts = Vec::new();
+    pub fn doubts(&self, config: &Config, scene: &Scene, region: &Region) -> Vec<String> {
+        let mut doubts: Vec<String> = cameras_in_matter(config, scene, region)
+            .into_iter()
+            .collect();
         let room = self.looks.facing == Facing::Outward;
         if config.surface.inside_out != room {
             let (meant, looks) = match room {
@@ -117,4 +119,24 @@ impl Suggestion {
         }
         doubts
     }
+}
+
+/// In rooms, cameras that stand outside the sphere which is free space at first: they see fog that training is slow to clear.
+fn cameras_in_matter(config: &Config, scene: &Scene, region: &Region) -> Option<String> {
+    if !config.surface.inside_out {
+        return None;
+    }
+    let region_from_world = region.world_from_region().inverse();
+    let position = |view: usize| {
+        let camera = scene.views[view].world_from_camera.w_axis.truncate();
+        region_from_world.transform_point3(camera).length()
+    };
+    let farthest = scene.split(Split::Train).map(position).fold(0.0, f64::max);
+    let free = config.surface.initial_radius();
+    (farthest > free).then(|| {
+        format!(
+            "cameras stand up to {farthest:.2} from the centre of the region (in its units), and space is free up to {free:.2} at first: fog around them is slow to go. A larger --region-scale, or --set surface.init_bias={:.1}, would hold them all",
+            (farthest / free * config.surface.init_bias * 10.0).ceil() / 10.0
+        )
+    })
 }

@@ -154,16 +154,17 @@ pub(super) fn configure(
         let config = described(settings, flags)?;
         let region = Region::estimate(scene, &region_wanted(flags, &config))?;
         return Ok(Chosen {
-            doubts: Suggestion::of(scene, &region)?.doubts(&config),
+            doubts: Suggestion::of(scene, &region)?.doubts(&config, scene, &region),
             why: String::new(),
             config,
         });
     }
     let suggestion = Suggestion::for_scene(scene, flags)?;
     let config = with_scene_flags(flags, settings.resolve(suggestion.config()?)?)?;
+    let region = Region::estimate(scene, &region_wanted(flags, &config))?;
     Ok(Chosen {
         why: suggestion.in_words(),
-        doubts: suggestion.doubts(&config),
+        doubts: suggestion.doubts(&config, scene, &region),
         config,
     })
 }
