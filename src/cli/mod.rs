@@ -1,5 +1,6 @@
 //! The command line: what was typed becomes what is meant; results go to stdout, everything else to stderr.
 
+mod bench;
 mod bias;
 mod compare;
 pub mod demo;
@@ -16,6 +17,7 @@ mod render;
 mod scene_args;
 mod settings;
 mod suggestion;
+mod timing;
 mod train;
 
 use clap::{
@@ -125,6 +127,7 @@ enum Command {
     Render(render::RenderArgs),
     Eval(eval::EvalArgs),
     Profile(Box<profile::ProfileArgs>),
+    Bench(bench::BenchArgs),
     Compare(Box<compare::CompareArgs>),
     Bias(Box<bias::BiasArgs>),
     Demo(demo::DemoArgs),
@@ -140,6 +143,7 @@ impl Command {
             Command::Render(args) => render::run(args, context),
             Command::Eval(args) => eval::run(args, context),
             Command::Profile(args) => profile::run(args, context),
+            Command::Bench(args) => bench::run(args, context),
             Command::Compare(args) => compare::run(args, context),
             Command::Bias(args) => bias::run(args, context),
             Command::Demo(args) => demo::run(args, context),

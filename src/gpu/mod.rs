@@ -46,5 +46,5 @@ pub use memory::{MemoryPlan, Overrun};
 pub use profile::{Event, Profile, ProfileRow};
 pub use queue::Ticket;
 pub use recorder::{Recorder, Work};
-pub use roofs::Roofs;
+pub use roofs::{Roofs, TableRoofs};
 pub use validation::ValidationLog;

@@ -1,10 +1,11 @@
-//! What the device can do at most, measured: the two roofs that a profile's rows are compared with (Williams et al. 2009).
+//! What the device can do at most, measured: the two roofs that a profile's rows are compared with (Williams et al. 2009), and how fast
+//! tables are read and added to at random.
 
 use super::device::Gpu;
 use super::instance::DeviceKind;
 use super::recorder::Work;
 use crate::Result;
-use crate::kernels::{roof_copy, roof_fma};
+use crate::kernels::{roof_copy, roof_fma, roof_gather, roof_scatter};
 use std::time::Instant;
 
 /// Fastest copy and fastest arithmetic of the device.
@@ -14,6 +15,16 @@ pub struct Roofs {
     pub copy_gb_s: f64,
     /// Float32 multiply-adds in registers, in 10⁹ operations per second (a multiply-add counts two).
     pub fma_gflop_s: f64,
+}
+
+/// How fast a table of one size is read and added to at random, in 10⁶ entries of eight floats per second.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct TableRoofs {
+    /// The table has 2^log2_entries entries.
+    pub log2_entries: u32,
+    pub gather_m_s: f64,
+    /// By float atomics.
+    pub scatter_m_s: f64,
 }
 
 /// Seconds that one timed submission takes at least, so that submitting does not count.
@@ -60,6 +71,48 @@ impl Gpu {
             copy_gb_s: 2.0 * copied as f64 / copy_seconds * 1e-9,
             fma_gflop_s: flops * launched as f64 / fma_seconds * 1e-9,
         })
+    }
+
+    /// Measures the rates of tables of these sizes, in about a second each.
+    pub fn measure_tables(&self, log2_entries: &[u32]) -> Result<Vec<TableRoofs>> {
+        const ENTRIES_PER_INVOCATION: f64 = 16.0;
+        let launched = match self.info().kind {
+            DeviceKind::Cpu | DeviceKind::Other => 1u64 << 14,
+            _ => 1 << 20,
+        };
+        let largest = log2_entries.iter().copied().max().unwrap_or(0);
+        let table = self.buffer::<f32>("roof table", 8 << largest)?;
+        let sums = self.buffer::<f32>("roof sums", launched)?;
+        let gather = self.kernel(roof_gather::Shape::default())?;
+        let scatter = self.kernel(roof_scatter::Shape::default())?;
+        let rate = |seconds: f64| launched as f64 * ENTRIES_PER_INVOCATION / seconds * 1e-6;
+        let mut measured = Vec::new();
+        for &log2_entries in log2_entries {
+            let mask = (1u32 << log2_entries) - 1;
+            let gathered = self.fastest(|rec| {
+                let args = roof_gather::Args {
+                    table: table.ptr().cast(),
+                    sums: sums.ptr_mut(),
+                    n: launched as u32,
+                    mask,
+                };
+                rec.run(&gather, Work::items(launched).bytes(512.0), args);
+            })?;
+            let scattered = self.fastest(|rec| {
+                let args = roof_scatter::Args {
+                    table: table.ptr_mut(),
+                    n: launched as u32,
+                    mask,
+                };
+                rec.run(&scatter, Work::items(launched).bytes(1024.0), args);
+            })?;
+            measured.push(TableRoofs {
+                log2_entries,
+                gather_m_s: rate(gathered),
+                scatter_m_s: rate(scattered),
+            });
+        }
+        Ok(measured)
     }
 
     /// Seconds of one launch, from as many at once as take long enough to be timed on the host.

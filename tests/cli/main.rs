@@ -133,7 +133,8 @@ fn help_shows_examples_and_exit_codes() {
         assert!(help.stdout.contains(code), "{code} in {}", help.stdout);
     }
     for command in [
-        "devices", "inspect", "train", "mesh", "render", "eval", "profile", "compare", "bias",
+        "devices", "inspect", "train", "mesh", "render", "eval", "profile", "bench", "compare",
+        "bias",
     ] {
         assert!(
             help.stdout.contains(&format!("  {command} ")),

@@ -144,3 +144,52 @@ fn write_ball(path: &Path) {
     }
     std::fs::write(path, text).unwrap();
 }
+
+#[test]
+fn a_bench_needs_no_dataset_and_two_are_compared() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name).to_str().unwrap().to_string();
+    let bench = |out: &str| {
+        let words = ["bench", "--presets", "outdoor-tiny", "--sizes", "0"];
+        run(&[&words[..], &["--seconds", "0.1", "--json", "--out", out]].concat())
+    };
+    let measured = bench(&path("a.json"));
+    assert_eq!(measured.code, Some(0), "{}", measured.stderr);
+    let result: Value = serde_json::from_str(&measured.stdout).unwrap();
+    assert_eq!(result["tables"].as_array().map(Vec::len), Some(3));
+    for table in result["tables"].as_array().unwrap() {
+        for rate in ["gather_m_per_s", "scatter_m_per_s"] {
+            assert!(table[rate].as_f64().is_some_and(|x| x > 0.1), "{table}");
+        }
+    }
+    let stages = result["presets"].as_array().unwrap();
+    assert_eq!(stages.len(), 2);
+    for stage in stages {
+        assert!(stage["rows"].as_array().unwrap().len() > 10);
+        let shares = stage["rows"].as_array().unwrap().iter();
+        let most = shares
+            .filter_map(|row| row["share_of_roof"].as_f64())
+            .fold(0.0, f64::max);
+        assert!(most > 0.01, "nothing comes near a roof: {most}");
+    }
+    assert_eq!(bench(&path("b.json")).code, Some(0));
+    let between = run(&["bench", "--between", &path("a.json"), &path("b.json")]);
+    assert_eq!(between.code, Some(0), "{}", between.stderr);
+    assert!(
+        between
+            .stderr
+            .contains("outdoor-tiny stage 1 (256 rays): adam"),
+        "{}",
+        between.stderr
+    );
+    fails(
+        &["bench", "--presets", "outdor-tiny"],
+        3,
+        &["'outdoor-tiny'"],
+    );
+    fails(
+        &["bench", "--between", &path("a.json"), &path("none.json")],
+        3,
+        &["none.json"],
+    );
+}

@@ -1,0 +1,298 @@
+//! `neurodin bench`: the device's roofs, every kernel against them, and the price of a step by the size of the dictionary.
+
+mod between;
+
+use super::profile::stop_if;
+use super::progress::Progress;
+use super::timing::{Timed, Until, time};
+use super::train::region_wanted;
+use super::{Context, interrupt};
+use crate::config::Config;
+use crate::gpu::{DeviceKind, GpuOptions, Roofs, TableRoofs};
+use crate::scene::synthetic::SyntheticOptions;
+use crate::scene::{Region, Scene};
+use crate::train::Trainer;
+use crate::train::run_directory::scene_options;
+use crate::{Error, Result};
+use clap::Args;
+use serde_json::{Value, json};
+use std::fmt::Write;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
+
+/// Measure the device, every kernel, and steps by the size of the dictionary
+#[derive(Args)]
+#[command(after_help = "\
+Example:
+  neurodin bench --out bench.json
+  neurodin bench --presets outdoor-tiny --sizes 19,22
+  neurodin bench --between before.json after.json
+
+It needs no dataset: pictures of the built-in scene are made for it. A software device gets the large presets with 64 rays.
+`roof %` is how near a kernel comes to the fastest copy or the fastest arithmetic, whichever is nearer, by what it was said to need.")]
+pub(super) struct BenchArgs {
+    /// Presets whose steps are timed, both stages of each
+    #[arg(
+        long,
+        value_name = "A,B,..",
+        value_delimiter = ',',
+        default_value = "outdoor-tiny,outdoor-large,indoor-small"
+    )]
+    pub presets: Vec<String>,
+    /// Dictionaries of outdoor-large whose steps are timed, as powers of two; 0 for none
+    #[arg(
+        long,
+        value_name = "N,M,..",
+        value_delimiter = ',',
+        default_value = "17,18,19,20,21,22"
+    )]
+    pub sizes: Vec<u32>,
+    /// Rays of the large presets [default: 64 on a software device, else those of the preset]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    pub rays: Option<u32>,
+    /// Time for the steps of each preset, stage and size
+    #[arg(long, value_name = "S", default_value_t = 10.0)]
+    pub seconds: f64,
+    /// Write the result as JSON to this file, too
+    #[arg(short, long, value_name = "FILE")]
+    pub out: Option<PathBuf>,
+    /// Compare two results instead of measuring
+    #[arg(long, num_args = 2, value_names = ["BEFORE", "AFTER"])]
+    pub between: Option<Vec<PathBuf>>,
+}
+
+pub(super) fn run(args: &BenchArgs, context: &Context) -> anyhow::Result<()> {
+    if let Some(files) = &args.between {
+        let (result, text) = between::compare(&files[0], &files[1])?;
+        return Ok(context.result(&result, &text)?);
+    }
+    for name in &args.presets {
+        Config::preset(name)?;
+    }
+    let bench = Bench::new(args, context)?;
+    let gpu = context.gpu()?;
+    context.say(&format!("device   {}", gpu.info().name));
+    let roofs = gpu.measure_roofs()?;
+    context.say(&format!(
+        "roofs    copy {:.1} GB/s, multiply-adds {:.1} GFLOP/s",
+        roofs.copy_gb_s, roofs.fma_gflop_s
+    ));
+    let tables = gpu.measure_tables(&[15, 19, 22])?;
+    for table in &tables {
+        context.say(&format!(
+            "table    2^{} entries of 32 bytes: {:.0} M gathered a second, {:.0} M added to",
+            table.log2_entries, table.gather_m_s, table.scatter_m_s
+        ));
+    }
+    let rays = args.rays.or(match gpu.info().kind {
+        DeviceKind::Cpu => Some(64),
+        _ => None,
+    });
+    let mut presets = Vec::new();
+    for name in &args.presets {
+        presets.extend(bench.preset(name, rays, &roofs)?);
+    }
+    let sizes: Vec<u32> = args
+        .sizes
+        .iter()
+        .copied()
+        .filter(|&size| size > 0)
+        .collect();
+    let dictionary = bench.dictionary(&sizes, rays, &roofs)?;
+    let result = json!({
+        "version": super::VERSION.as_str(),
+        "device": gpu.info().name,
+        "driver": gpu.info().driver,
+        "roofs": { "gb_per_s": roofs.copy_gb_s, "gflop_per_s": roofs.fma_gflop_s },
+        "tables": tables.iter().map(table_json).collect::<Vec<_>>(),
+        "presets": presets,
+        "dictionary": dictionary,
+    });
+    if let Some(path) = &args.out {
+        std::fs::write(path, format!("{result:#}\n")).map_err(|error| {
+            Error::output(
+                path,
+                format!("cannot be written: {error}"),
+                "make room there",
+            )
+        })?;
+    }
+    Ok(context.result(&result, "")?)
+}
+
+fn table_json(table: &TableRoofs) -> Value {
+    json!({
+        "log2_entries": table.log2_entries,
+        "gather_m_per_s": table.gather_m_s,
+        "scatter_m_per_s": table.scatter_m_s,
+    })
+}
+
+/// What steps are taken on: pictures of the built-in scene, in a folder that goes with it.
+struct Bench<'c> {
+    context: &'c Context,
+    folder: PathBuf,
+    interrupted: std::sync::Arc<AtomicBool>,
+    seconds: f64,
+}
+
+impl Drop for Bench<'_> {
+    fn drop(&mut self) {
+        // What is left of it would be a nuisance, not a fault.
+        let _ = std::fs::remove_dir_all(&self.folder);
+    }
+}
+
+/// Steps that are not timed: the first ones compile the kernels.
+const WARMUP: u64 = 3;
+
+impl<'c> Bench<'c> {
+    fn new(args: &BenchArgs, context: &'c Context) -> anyhow::Result<Bench<'c>> {
+        let folder = std::env::temp_dir().join(format!("neurodin-bench-{}", std::process::id()));
+        let bench = Bench {
+            context,
+            interrupted: interrupt::flag("stopping")?,
+            seconds: args.seconds,
+            folder,
+        };
+        let pictures = SyntheticOptions {
+            train_views: 12,
+            test_views: 1,
+            width: 160,
+            height: 120,
+            reference_spacing: 0.5,
+        };
+        pictures.write(&bench.folder, &mut |_, _, _| {})?;
+        Ok(bench)
+    }
+
+    /// Both stages of a preset.
+    fn preset(&self, name: &str, rays: Option<u32>, roofs: &Roofs) -> anyhow::Result<Vec<Value>> {
+        let config = with_rays(Config::preset(name)?, rays);
+        let second = config.second_stage().map(|second| (2, second));
+        let mut measured = Vec::new();
+        for (stage, config) in std::iter::once((1, config)).chain(second) {
+            let what = format!("{name}, stage {stage}, {} rays", config.rays);
+            let (timed, device_bytes) = self.time(&config, &what)?;
+            self.context
+                .say(&format!("\n{what}\n{}", timed.text(roofs)));
+            let mut result = timed.to_json(roofs);
+            result["preset"] = name.into();
+            result["stage"] = stage.into();
+            result["rays"] = config.rays.into();
+            result["device_bytes"] = device_bytes.into();
+            measured.push(result);
+        }
+        Ok(measured)
+    }
+
+    /// Steps of outdoor-large by the size of its dictionary, both stages with as many rays, and their ratio to those at 2^19.
+    fn dictionary(
+        &self,
+        sizes: &[u32],
+        rays: Option<u32>,
+        roofs: &Roofs,
+    ) -> anyhow::Result<Vec<Value>> {
+        let mut rows: Vec<Value> = Vec::new();
+        for &log2_size in sizes {
+            let mut config = with_rays(Config::preset("outdoor-large")?, rays);
+            config.hash.log2_size = log2_size;
+            let what = format!("outdoor-large at 2^{log2_size}, {} rays", config.rays);
+            match self.time(&config.validated()?, &what) {
+                Ok((timed, device_bytes)) => {
+                    let mut row = timed.to_json(roofs);
+                    row["log2_size"] = log2_size.into();
+                    row["device_bytes"] = device_bytes.into();
+                    rows.push(row);
+                }
+                // A size that does not fit is an answer.
+                Err(Error::OutOfMemory { what }) => {
+                    self.context.warn(&format!("2^{log2_size}: {what}"));
+                }
+                Err(error) => return Err(error.into()),
+            }
+        }
+        if rows.is_empty() {
+            return Ok(rows);
+        }
+        let of = |row: &Value, key: &str| row[key].as_f64().unwrap_or(f64::NAN);
+        let base = rows.iter().find(|row| row["log2_size"] == 19);
+        let base = base.map(|row| [of(row, "cpu_ms_per_step"), of(row, "device_ms_per_step")]);
+        let mut text = String::from(
+            "\nstage 1 by dictionary   CPU ms    ratio   device ms    ratio        MiB\n",
+        );
+        for row in &mut rows {
+            let times = [of(row, "cpu_ms_per_step"), of(row, "device_ms_per_step")];
+            let ratios = base.map(|base| [times[0] / base[0], times[1] / base[1]]);
+            let shown = |ratio: Option<f64>| ratio.map_or("-".into(), |r| format!("{r:.3}"));
+            let _ = writeln!(
+                text,
+                "2^{:<20} {:>8.1} {:>8} {:>11.1} {:>8} {:>10.0}",
+                row["log2_size"],
+                times[0],
+                shown(ratios.map(|r| r[0])),
+                times[1],
+                shown(ratios.map(|r| r[1])),
+                of(row, "device_bytes") / f64::from(1 << 20)
+            );
+            row["ratio_of_cpu_ms"] = ratios.map(|r| r[0]).into();
+            row["ratio_of_device_ms"] = ratios.map(|r| r[1]).into();
+        }
+        self.context.say(&text);
+        Ok(rows)
+    }
+
+    /// Times steps of one configuration; also says how much device memory it takes.
+    fn time(&self, config: &Config, what: &str) -> Result<(Timed, u64)> {
+        let gpu = self.context.gpu_with(GpuOptions {
+            profile: true,
+            ..GpuOptions::default()
+        })?;
+        let scene = Scene::open(&self.folder, &scene_options(config))?;
+        let region = Region::estimate(&scene, &region_wanted(&Default::default(), config))?;
+        let mut trainer = Trainer::new(&gpu, &scene, &region, config)?;
+        let mut progress = Progress::new(self.context, "bench", config.total_steps());
+        let timed = time(
+            &gpu,
+            &mut trainer,
+            WARMUP,
+            Until::Seconds(self.seconds),
+            &mut |step| {
+                progress.at(step, what);
+                stop_if(&self.interrupted)
+            },
+        )?;
+        Ok((timed, gpu.memory_plan().total))
+    }
+}
+
+/// The large presets' batches are for GPUs.
+fn with_rays(config: Config, rays: Option<u32>) -> Config {
+    let mut config = config;
+    if let Some(rays) = rays.filter(|_| !config.preset.contains("tiny")) {
+        config.rays = rays;
+        config.stage2.rays = rays;
+    }
+    config
+}
+
+/// Reads a result that `--out` wrote.
+fn read(path: &Path) -> Result<Value> {
+    let text = std::fs::read_to_string(path).map_err(|error| {
+        Error::input(
+            path,
+            format!("cannot be read: {error}"),
+            "name a file that `neurodin bench --out` wrote",
+        )
+    })?;
+    serde_json::from_str(&text)
+        .ok()
+        .filter(|value: &Value| value["presets"].is_array())
+        .ok_or_else(|| {
+            Error::input(
+                path,
+                "is no result of a bench",
+                "name a file that `neurodin bench --out` wrote",
+            )
+        })
+}
