@@ -71,7 +71,7 @@ impl Loss {
             square: gpu.scratch("square error", n)?,
             // Zero-filled: stays so where bias correction is off.
             bias: gpu.buffer("bias loss", n)?,
-            gate: gpu.buffer("bias gate", n)?,
+            gate: gpu.scratch("bias gate", n)?,
             heaviest: gpu.scratch("heaviest sample", n)?,
             queries: gpu.scratch("bias queries", 6 * n)?,
             query_field: FieldBuffers::new(
@@ -116,17 +116,8 @@ impl Loss {
         );
     }
 
-    /// Explicit bias correction (METHOD 4.3): finds each ray's heaviest sample, asks the SDF just behind it, and pushes it below zero
-    /// where it still is free space. Adds the gradients.
-    pub fn bias(
-        &self,
-        rec: &mut Recorder,
-        model: &Model,
-        composite: &Composite,
-        look: &Look,
-        scratch: &Scratch,
-        weight: f32,
-    ) {
+    /// Finds each ray's heaviest sample, the points behind it that bias correction asks, and whether the ray meets an opaque surface.
+    pub fn heaviest(&self, rec: &mut Recorder, composite: &Composite, look: &Look) {
         let args = heaviest_sample::Args {
             weights: composite.weights.ptr(),
             sdf: look.surface.sdf.ptr(),
@@ -153,6 +144,11 @@ impl Loss {
                 .bytes(samples / 8.0),
             args,
         );
+    }
+
+    /// Explicit bias correction (METHOD 4.3): asks the SDF just behind each ray's [`Loss::heaviest`] sample, and pushes it below zero
+    /// where it still is free space. Adds the gradients.
+    pub fn bias(&self, rec: &mut Recorder, model: &Model, scratch: &Scratch, weight: f32) {
         model.surface.probes.forward(
             rec,
             &model.params,

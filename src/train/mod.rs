@@ -193,15 +193,9 @@ impl Trainer {
         render.forward(rec, model, annealed, true);
         // Loss: its value for the log, its gradient for everything below; a few more points are asked behind the heaviest samples.
         loss.color(rec, &render.composite, &look);
+        loss.heaviest(rec, &render.composite, &look);
         if now.bias_weight > 0.0 {
-            loss.bias(
-                rec,
-                model,
-                &render.composite,
-                &look,
-                &self.scratch,
-                now.bias_weight as f32,
-            );
+            loss.bias(rec, model, &self.scratch, now.bias_weight as f32);
         }
         // Backward: the same sentence, right to left.
         render.composite.backward(rec, &look, model, &loss.d_color);

@@ -1,6 +1,7 @@
 //! `Trainer::step` in the middle of a run, in several configurations, against the twin given the same rays, draws and parameters.
 
 use crate::reference::batch::{Now, Outcome, Step, StepConfig};
+use crate::reference::losses;
 use crate::reference::optimizer::Adam;
 use crate::reference::sampling;
 use crate::reference::tape::ReluEdge;
@@ -237,6 +238,7 @@ fn check(config: Config, shape: RegionShape, seed: u64, portable: bool) -> Resul
     let twin = step.run();
     check_images(&rig, &twin)?;
     check_losses(&twin, &losses, &named);
+    check_crossing(&rig, &twin, &losses);
     check_update(&rig, &GradientRange::of(&step), &params, [&m0, &v0], &now)?;
     rig.check_device()
 }
@@ -346,6 +348,24 @@ fn check_losses(twin: &Outcome, device: &StepLosses, named: &[&str]) {
             "{name} loss {device}, twin {twin}"
         );
     }
+}
+
+/// The share of rays that meet an opaque surface is told in every stage.
+fn check_crossing(rig: &Rig, twin: &Outcome, device: &StepLosses) {
+    let images = &twin.images;
+    let samples = rig.twin.samples;
+    let meets = |ray: usize| {
+        let row = ray * samples..(ray + 1) * samples;
+        let (sdf, weights) = (&images.sdf[row.clone()], &images.weights[row]);
+        match images.stretches[ray].outside {
+            true => 0.0,
+            false => losses::bias_gate(sdf, weights, rig.twin.bias_needs_opaque),
+        }
+    };
+    let share = (0..rig.n_rays()).map(meets).sum::<f64>() / rig.n_rays() as f64;
+    let told = TERMS.iter().position(|term| *term == "crossing");
+    let told = f64::from(device.values[told.expect("one of the terms")]);
+    assert!((told - share).abs() < 1e-6, "crossing {told}, twin {share}");
 }
 
 /// The device's gradients, read off the first moments, against the twin's; and what AdamW makes of them.
