@@ -152,6 +152,7 @@ impl Loss {
                 .bytes(samples / 8.0),
             args,
         );
+        model.touch(rec, self.queries.ptr(), self.query_field.n);
         model.surface.probes.forward(
             rec,
             &model.params,

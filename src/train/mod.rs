@@ -159,7 +159,7 @@ impl Trainer {
                 .draw(rec, &self.views, &self.renderer.draws);
             self.gradients(rec, &now);
             self.optimizer
-                .update(rec, &self.model.params, &now, &self.loss.bad_step);
+                .update(rec, &self.model, &now, &self.loss.bad_step);
             let width = TERMS.len() as u64 + 1;
             rec.copy(
                 &self.loss.sums,
@@ -267,6 +267,21 @@ impl Trainer {
         StepLosses { step, values }
     }
 
+    /// Brings all parameters up to date, for whoever reads them outside of a step: of the hash table, a step only changes what it needs.
+    ///
+    /// # Errors
+    /// What the device fails with.
+    pub fn catch_up(&self) -> Result<()> {
+        let Some(table) = &self.model.table else {
+            return Ok(());
+        };
+        self.gpu.submit("catch up", |rec| {
+            table.flush(rec, &self.model.params);
+            Ok(())
+        })?;
+        Ok(())
+    }
+
     /// Renders view `view` of the scene at its picture's size, at the current step; other views than those trained with by the appearance
     /// code zero, since the mean of the others is taken when training is over ([`trained`]).
     pub fn render(
@@ -296,6 +311,7 @@ impl Trainer {
         appearance: u32,
         keep_going: &mut dyn FnMut(f64) -> bool,
     ) -> Result<Rendered> {
+        self.catch_up()?;
         let now = annealed(&self.schedule.at(self.step));
         self.renderer.view(
             &self.gpu,
@@ -309,6 +325,7 @@ impl Trainer {
         )
     }
 
+    /// The model; its parameters are those of all steps done after [`Trainer::catch_up`].
     pub fn model(&self) -> &Model {
         &self.model
     }
