@@ -21,6 +21,7 @@ layout(push_constant, scalar) uniform Args {
     float correction;   // √(1 − β₂ᵗ)
     float share1;       // 1 − β₁
     float share2;       // 1 − β₂
+    float most;         // share of a level's entries
 };
 
 // Steps after which a level that was mostly touched is marked again, to see whether it still is.
@@ -33,7 +34,7 @@ void main() {
     barrier();
     if (row < LEVELS) {
         LevelUse use = uses.at[row];
-        uint whole = mostly_touched(levels.at[row], use.touched) ? WHOLE : 0u;
+        uint whole = mostly_touched(levels.at[row], use.touched, most) ? WHOLE : 0u;
         uses.at[row] = LevelUse(0u, use.whole != 0u ? use.whole - 1u : whole);
     }
     if (bad) return;

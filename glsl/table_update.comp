@@ -1,12 +1,13 @@
 #version 460
-// AdamW of the hash table: of the marked entries of a level (the slice), or of all where most are marked. One workgroup for a block of
-// entries. Gradients, marks and stamps are consumed in passing. A step whose loss is not finite changes nothing.
-// Every block is gone over as a whole once in so many steps, so that no entry is left alone for as long as stamps can count.
+// AdamW of the hash table: of the marked entries of a level (the slice), or of all where most are marked. An invocation walks over the
+// marks of a strip of entries. Gradients and marks are consumed in passing. A step whose loss is not finite changes nothing.
+// Every strip is gone over as a whole once in so many steps, so that no entry is left alone for as long as stamps can count.
 #include "lib/prelude.glsl"
 #include "lib/hash_grid.glsl"
 #include "lib/lazy_table.glsl"
 
 layout(constant_id = 0) const uint FEATURES = 2;
+layout(constant_id = 1) const uint STRIP = 16;  // words of 32 marks: long strips have equally much to do, short ones are many
 
 layout(push_constant, scalar) uniform Args {
     Levels levels;
@@ -26,14 +27,12 @@ layout(push_constant, scalar) uniform Args {
     float share1;         // 1 − β₁
     float share2;         // 1 − β₂
     float epsilon;
+    float most;             // share of a level's entries
     uint step;
 };
 
 const uint SWEEP = 240u;  // steps
 const uint TURN = 8u;  // parameters of an invocation in one turn of a loop
-
-shared uint listed[BLOCK / 2u];  // more of a block are gone over as a whole
-shared uint n_listed;
 
 uint now, next;
 bool bad;
@@ -68,59 +67,50 @@ void update_stale(uint entry, uint slot, bool marked) {
         first_moment.at[i] = x.m;
         second_moment.at[i] = x.v;
     }
-    // Turns the old stamp's byte into the new one's and leaves its neighbours alone.
-    atomicXor(stamps.at[slot >> 2u], (stamp ^ next) << (8u * (slot & 3u)));
+    stamps.at[slot >> 2u] ^= (stamp ^ next) << (8u * (slot & 3u));
 }
 
 void main() {
     uint l = slice();
     Level level = levels.at[l];
     LevelUse use = uses.at[l];
-    uint block = group(), lane = gl_LocalInvocationID.x;
-    if (block * BLOCK >= level.entries) return;
-    uint first = level.offset + block * BLOCK;
-    uint n_entries = min(BLOCK, level.entries - block * BLOCK);
-    uint slots = first_slot(level, l) + block * BLOCK;
     now = clock.at[0];
     bad = bad_step.at[0] != 0u;
     next = bad ? now : (now + 1u) % READINGS;
     rates = Rates(rate, decay, correction, share1, share2, epsilon);
 
     if (use.whole != 0u) {
-        uint n_params = n_entries * FEATURES;
+        uint first = group() * LOCAL_SIZE * STRIP * 32u, lane = gl_LocalInvocationID.x;
+        if (first >= level.entries) return;
+        uint n_entries = min(LOCAL_SIZE * STRIP * 32u, level.entries - first), n_params = n_entries * FEATURES;
         for (uint j = lane; j < n_params; j += TURN * LOCAL_SIZE) {
             [[unroll]] for (uint k = 0u; k < TURN; ++k) {
-                if (j + k * LOCAL_SIZE < n_params) update(first * FEATURES + j + k * LOCAL_SIZE);
+                if (j + k * LOCAL_SIZE < n_params) update((level.offset + first) * FEATURES + j + k * LOCAL_SIZE);
             }
         }
         // The next step marks this level again, and needs its stamps.
         if (use.whole == 1u) {
-            for (uint word = lane; word < BLOCK / 4u; word += LOCAL_SIZE) stamps.at[slots / 4u + word] = next * 0x01010101u;
+            uint words = (first_slot(level, l) + first) / 4u;
+            for (uint j = lane; j < n_entries / 4u; j += LOCAL_SIZE) stamps.at[words + j] = next * 0x01010101u;
         }
         return;
     }
 
-    bool all = mostly_touched(level, use.touched) || block % SWEEP == step % SWEEP;
-    if (!all) {
-        if (lane == 0u) n_listed = 0u;
-        barrier();
-        for (uint word = lane; word < BLOCK / 32u; word += LOCAL_SIZE) {
-            uint bits = marks.at[slots / 32u + word];
-            uint at = atomicAdd(n_listed, bitCount(bits));
-            if (at + bitCount(bits) > BLOCK / 2u) continue;
-            for (; bits != 0u; bits &= bits - 1u) listed[at++] = word * 32u + findLSB(bits);
+    uint word = item() * STRIP, end = min(word + STRIP, (level.entries + 31u) / 32u);
+    bool all = mostly_touched(level, use.touched, most) || item() / 8u % SWEEP == step % SWEEP;
+    uint marked = 0u, bits = 0u;
+    while (true) {
+        // The next word with something to do.
+        for (; bits == 0u && word < end; ++word) {
+            uint at = first_slot(level, l) / 32u + word;
+            marked = marks.at[at];
+            if (marked != 0u) marks.at[at] = 0u;
+            uint n_entries = min(level.entries - word * 32u, 32u);
+            bits = all ? ~0u >> (32u - n_entries) : marked;
         }
-        barrier();
-        all = n_listed > BLOCK / 2u;
+        if (bits == 0u) break;
+        uint entry = (word - 1u) * 32u + findLSB(bits);
+        update_stale(level.offset + entry, first_slot(level, l) + entry, (marked & bits & (~bits + 1u)) != 0u);
+        bits &= bits - 1u;
     }
-    if (all) {
-        for (uint e = lane; e < n_entries; e += LOCAL_SIZE) {
-            uint slot = slots + e;
-            update_stale(first + e, slot, (marks.at[slot >> 5u] >> (slot & 31u) & 1u) != 0u);
-        }
-    } else {
-        for (uint k = lane; k < n_listed; k += LOCAL_SIZE) update_stale(first + listed[k], slots + listed[k], true);
-    }
-    barrier();
-    for (uint word = lane; word < BLOCK / 32u; word += LOCAL_SIZE) marks.at[slots / 32u + word] = 0u;
 }

@@ -33,14 +33,11 @@ struct LevelUse {
 layout(buffer_reference, scalar) readonly buffer LevelUses { LevelUse at[]; };
 layout(buffer_reference, scalar) buffer LevelUsesMut { LevelUse at[]; };
 
-// Entries in a block, which one workgroup updates. Marks (a bit each) and stamps (a byte each) are kept by slots: entries, but every
-// level begins with a block of its own.
-const uint BLOCK = 8192u;
+// Marks (a bit each) and stamps (a byte each) are kept by slots: entries, but every level begins with a word of marks of its own.
+uint first_slot(Level level, uint l) { return (level.offset / 32u + l) * 32u; }
 
-uint first_slot(Level level, uint l) { return (level.offset / BLOCK + l) * BLOCK; }
-
-// Whether more than two thirds of a level are marked: then its update goes over all of it (counted in bytes, 65 % is where it pays).
-bool mostly_touched(Level level, uint touched) { return 3.0 * float(touched) > 2.0 * float(level.entries); }
+// Whether so many of a level are marked that its update had better go over all of it.
+bool mostly_touched(Level level, uint touched, float most) { return float(touched) > most * float(level.entries); }
 
 uint stamp_in(uint word, uint slot) { return (word >> (8u * (slot & 3u))) & 255u; }
 
@@ -48,15 +45,18 @@ const Lag NO_LAG = Lag(0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 1.0);
 
 // p of an entry that stands at `stamp`, with its row, as it should be at `now`.
 float caught_up(Moving x, Lag lag, Lags lags, uint stamp, uint now, Rates r) {
-    float root = sqrt(x.v);
-    if (r.epsilon * lag.slowing > 0.01 * root && x.m != 0.0) {
-        // Gradients so small that ε counts: step by step.
+    float slowing = r.epsilon * lag.slowing;
+    float inverse = 1.0 / max(sqrt(x.v) + slowing, 1e-37);
+    float moved = lag.momentum * x.m * inverse;
+    // The mean b stands for all b_j as long as ε is small. What is neglected is (ε b/(√v + ε b))² of the move, times the relative variance
+    // of the b_j: a tenth, if both the first steps and the longest lags are in it. Where that could matter: step by step.
+    float small = slowing * inverse;
+    if (abs(moved) * small * small > 2e-7) {
         for (uint k = stamp; k != now; k = (k + 1u) % READINGS) {
             Lag next = lags.at[(k + 1u) % READINGS];
             x = adam_step(x, 0.0, Rates(next.step_rate, next.step_decay, next.step_correction, r.share1, r.share2, r.epsilon));
         }
         return x.p;
     }
-    float moved = x.m != 0.0 && lag.momentum > 0.0 ? lag.momentum * x.m / (root + r.epsilon * lag.slowing) : 0.0;
     return x.p - fma(lag.decay, x.p, moved);
 }
