@@ -1,6 +1,6 @@
 #version 460
-// AdamW of the hash table: of the marked entries of a level (the slice), or of all where most are marked. An invocation walks over the
-// marks of a strip of entries. Gradients and marks are consumed in passing. A step whose loss is not finite changes nothing.
+// AdamW of the hash table: of the marked entries of a level (the slice), or of all where most are marked; levels that are up to date as
+// a whole are table_update_whole's. An invocation walks over the marks of a strip of entries. Gradients and marks are consumed in passing. A step whose loss is not finite changes nothing.
 // Every strip is gone over as a whole once in so many steps, so that no entry is left alone for as long as stamps can count.
 #include "lib/prelude.glsl"
 #include "lib/hash_grid.glsl"
@@ -32,22 +32,10 @@ layout(push_constant, scalar) uniform Args {
 };
 
 const uint SWEEP = 240u;  // steps
-const uint TURN = 8u;  // parameters of an invocation in one turn of a loop
 
 uint now, next;
 bool bad;
 Rates rates;
-
-// The update of parameter i, whose entry is up to date.
-void update(uint i) {
-    float g = grads.at[i];
-    grads.at[i] = 0.0;
-    if (bad) return;
-    Moving x = adam_step(Moving(table.at[i], first_moment.at[i], second_moment.at[i]), g, rates);
-    table.at[i] = x.p;
-    first_moment.at[i] = x.m;
-    second_moment.at[i] = x.v;
-}
 
 // The update of an entry whose moments are as old as its stamp, and p is too, unless it is marked.
 void update_stale(uint entry, uint slot, bool marked) {
@@ -74,27 +62,11 @@ void main() {
     uint l = slice();
     Level level = levels.at[l];
     LevelUse use = uses.at[l];
+    if (use.whole != 0u) return;
     now = clock.at[0];
     bad = bad_step.at[0] != 0u;
     next = bad ? now : (now + 1u) % READINGS;
     rates = Rates(rate, decay, correction, share1, share2, epsilon);
-
-    if (use.whole != 0u) {
-        uint first = group() * LOCAL_SIZE * STRIP * 32u, lane = gl_LocalInvocationID.x;
-        if (first >= level.entries) return;
-        uint n_entries = min(LOCAL_SIZE * STRIP * 32u, level.entries - first), n_params = n_entries * FEATURES;
-        for (uint j = lane; j < n_params; j += TURN * LOCAL_SIZE) {
-            [[unroll]] for (uint k = 0u; k < TURN; ++k) {
-                if (j + k * LOCAL_SIZE < n_params) update((level.offset + first) * FEATURES + j + k * LOCAL_SIZE);
-            }
-        }
-        // The next step marks this level again, and needs its stamps.
-        if (use.whole == 1u) {
-            uint words = (first_slot(level, l) + first) / 4u;
-            for (uint j = lane; j < n_entries / 4u; j += LOCAL_SIZE) stamps.at[words + j] = next * 0x01010101u;
-        }
-        return;
-    }
 
     uint word = item() * STRIP, end = min(word + STRIP, (level.entries + 31u) / 32u);
     bool all = mostly_touched(level, use.touched, most) || item() / 8u % SWEEP == step % SWEEP;
