@@ -48,11 +48,11 @@ fn a_restored_run_takes_the_same_next_step() {
     let folder = tempfile::tempdir().unwrap();
     let scene = scene(folder.path());
     let region = sphere(1.1);
-    // Every kind of parameter there is: codes, a background field, both proposals.
+    // Every kind of parameter there is: codes, a background field, both proposals, and a table of which a step leaves a part alone.
     let config = Config::preset("outdoor-tiny")
         .and_then(|config| {
             config.with_toml(
-                "steps = 40\nrays = 32\nappearance.dims = 8\nbackground.kind = 'field'\nbackground.samples = 8\nhash.levels = 4\nhash.log2_size = 10",
+                "steps = 40\nrays = 32\nappearance.dims = 8\nbackground.kind = 'field'\nbackground.samples = 8\nhash.levels = 4\nhash.log2_size = 17",
                 "test",
             )
         })
@@ -63,6 +63,7 @@ fn a_restored_run_takes_the_same_next_step() {
     for _ in 0..6 {
         first.step().unwrap();
     }
+    assert!(first.model().table.is_some());
     let saved = first.save(&folder.path().join("first")).unwrap();
     let begun_anew = Checkpoint::open(&saved).unwrap();
     let moved = |name: &str| begun_anew.tensor(name).unwrap().1.iter().any(|x| *x != 0.0);

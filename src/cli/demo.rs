@@ -388,6 +388,7 @@ impl<'c> Demo<'c> {
             steepest: Some(4.0),
             ..ExtractOptions::default()
         };
+        trainer.catch_up()?;
         let mut field = Field::new(gpu, trainer.config(), trainer.model(), trainer.annealed())?;
         let mut shown: Option<(mesh::extract::Stage, Progress)> = None;
         let mesh = mesh::extract_mesh(&mut field, &options, &mut |now| {

@@ -294,6 +294,11 @@ impl Field {
         })
     }
 
+    /// Element offset of the grid's table in the parameter block.
+    pub(super) fn table(&self) -> u64 {
+        self.table
+    }
+
     fn gather_bytes(&self) -> f64 {
         32.0 * f64::from(self.shape.grid.outputs())
     }

@@ -5,6 +5,7 @@ mod background;
 mod field;
 mod hash_grid;
 mod layer;
+mod lazy_table;
 mod params;
 mod proposal;
 mod surface;
@@ -13,13 +14,14 @@ pub use background::{Background, BackgroundBuffers, BackgroundRays};
 pub use field::{Field, FieldBuffers, FieldShape, Scratch};
 pub use hash_grid::HashGrid;
 pub use layer::{Activation, Layer};
+pub use lazy_table::{LazyTable, Rates};
 pub use params::{Group, Init, Params, ParamsPlan, Span, WeightHandle};
 pub use proposal::{Proposal, ProposalBuffers};
 pub use surface::{ShadeInputs, Surface, SurfaceBuffers, TapStep};
 
 use crate::Result;
 use crate::config::Config;
-use crate::gpu::{Gpu, Recorder};
+use crate::gpu::{Gpu, Ptr, Recorder};
 
 /// Everything that is learned.
 pub struct Model {
@@ -27,6 +29,8 @@ pub struct Model {
     pub surface: Surface,
     pub proposals: Vec<Proposal>,
     pub background: Background,
+    /// What of the surface's table a step leaves alone, where the model learns.
+    pub table: Option<LazyTable>,
     /// Number of training views, each with an appearance code; the row after them is the code for evaluation.
     pub n_views: u32,
 }
@@ -47,7 +51,16 @@ impl Model {
             .map(|level| Proposal::new(gpu, config, &mut plan, level))
             .collect::<Result<_>>()?;
         let background = Background::new(gpu, config, &mut plan, n_views, sky)?;
+        let table = match learns {
+            true => {
+                let points = config.rays * config.sampling.samples * surface.blocks();
+                let (grid, table) = (&surface.field.shape.grid, surface.field.table());
+                LazyTable::new(gpu, grid, table, &config.optimizer, points)?
+            }
+            false => None,
+        };
         Ok(Model {
+            table,
             params: plan.build(gpu, config.seed, learns)?,
             surface,
             proposals,
@@ -66,6 +79,13 @@ impl Model {
     pub fn fold_gradients(&self, rec: &mut Recorder, released_levels: u32) {
         let columns = self.surface.released_columns(released_levels);
         self.params.fold_gradients(rec, columns);
+    }
+
+    /// Before a training step asks the surface at `points [3, n]`: what it will read of the table is brought up to date.
+    pub fn touch(&self, rec: &mut Recorder, points: Ptr<f32>, n: u32) {
+        if let Some(table) = &self.table {
+            table.touch(rec, &self.params, points, n);
+        }
     }
 
     /// Sets the appearance code that evaluation uses: zero, which it is at first, or the mean of the views' codes.

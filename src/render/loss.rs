@@ -149,6 +149,7 @@ impl Loss {
     /// Explicit bias correction (METHOD 4.3): asks the SDF just behind each ray's [`Loss::heaviest`] sample, and pushes it below zero
     /// where it still is free space. Adds the gradients.
     pub fn bias(&self, rec: &mut Recorder, model: &Model, scratch: &Scratch, weight: f32) {
+        model.touch(rec, self.queries.ptr(), self.query_field.n);
         model.surface.probes.forward(
             rec,
             &model.params,

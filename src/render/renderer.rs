@@ -137,6 +137,9 @@ impl Renderer {
             train,
             &self.surface.points,
         );
+        if train {
+            model.touch(rec, self.surface.points.ptr(), self.surface.field.n);
+        }
         model
             .surface
             .forward(rec, &model.params, &self.surface, &self.shade_inputs(now));

@@ -67,6 +67,7 @@ impl Tangent {
         };
         rec.run(&self.place, per_sample, args);
         let (params, field, points) = (&model.params, model.surface.beside(), self.points.ptr());
+        model.touch(rec, points, n);
         field.encode(rec, params, points, &self.field);
         field.gradient(rec, params, points, &self.field);
         let args = tangent_loss::Args {

@@ -1,11 +1,12 @@
-//! AdamW over the parameter block, one launch per group: the groups differ in learning rate and weight decay.
+//! AdamW over the parameter block, one launch per group: the groups differ in learning rate and weight decay. The surface's hash table,
+//! of which a step needs little, is updated where it is needed.
 
 use super::schedule::Now;
 use crate::Result;
 use crate::config::{Config, OptimizerConfig};
 use crate::gpu::{Buffer, Gpu, Kernel, Recorder, Work};
 use crate::kernels::adam;
-use crate::model::{Group, Params};
+use crate::model::{Group, Model, Rates};
 
 /// The optimiser of all parameter groups.
 pub struct Adam {
@@ -23,8 +24,8 @@ impl Adam {
     }
 
     /// One update of every parameter with the rates of `now`; gradients are consumed. `now.step` counts from 0.
-    pub fn update(&self, rec: &mut Recorder, params: &Params, now: &Now, bad_step: &Buffer<u32>) {
-        let c = &self.config;
+    pub fn update(&self, rec: &mut Recorder, model: &Model, now: &Now, bad_step: &Buffer<u32>) {
+        let (c, params) = (&self.config, &model.params);
         let t = (now.step + 1) as f64;
         let groups = [
             (Group::Fields, now.lr_fields, c.fields.weight_decay),
@@ -37,9 +38,18 @@ impl Adam {
             ),
         ];
         for (group, learning_rate, weight_decay) in groups {
-            let Some(range) = params.group(group) else {
+            let rates = Rates {
+                rate: (learning_rate / (1.0 - c.beta1.powf(t))) as f32,
+                decay: (learning_rate * weight_decay) as f32,
+                correction: (1.0 - c.beta2.powf(t)).sqrt() as f32,
+            };
+            let Some(mut range) = params.group(group) else {
                 continue;
             };
+            if let (Group::Table, Some(table)) = (group, &model.table) {
+                table.update(rec, params, &rates, now.step, bad_step);
+                range.end = table.first();
+            }
             let n = range.end - range.start;
             let args = adam::Args {
                 params: params.values().at_mut(range.start),
@@ -48,12 +58,11 @@ impl Adam {
                 second_moment: params.second_moment().at_mut(range.start),
                 bad_step: bad_step.ptr(),
                 n: n as u32,
-                learning_rate: learning_rate as f32,
-                weight_decay: weight_decay as f32,
-                beta1: c.beta1 as f32,
-                beta2: c.beta2 as f32,
-                correction1: (1.0 - c.beta1.powf(t)) as f32,
-                correction2: (1.0 - c.beta2.powf(t)).sqrt() as f32,
+                rate: rates.rate,
+                decay: rates.decay,
+                correction: rates.correction,
+                share1: (1.0 - c.beta1) as f32,
+                share2: (1.0 - c.beta2) as f32,
                 epsilon: c.epsilon as f32,
             };
             rec.run(&self.kernel, Work::items(n).flops(15.0).bytes(32.0), args);

@@ -162,7 +162,7 @@ impl Trainer {
                 .draw(rec, &self.views, &self.renderer.draws);
             self.gradients(rec, &now);
             self.optimizer
-                .update(rec, &self.model.params, &now, &self.loss.bad_step);
+                .update(rec, &self.model, &now, &self.loss.bad_step);
             let width = TERMS.len() as u64 + 1;
             rec.copy(
                 &self.loss.sums,
@@ -262,6 +262,21 @@ impl Trainer {
         StepLosses { step, values }
     }
 
+    /// Brings all parameters up to date, for whoever reads them outside of a step: of the hash table, a step only changes what it needs.
+    ///
+    /// # Errors
+    /// What the device fails with.
+    pub fn catch_up(&self) -> Result<()> {
+        let Some(table) = &self.model.table else {
+            return Ok(());
+        };
+        self.gpu.submit("catch up", |rec| {
+            table.flush(rec, &self.model.params);
+            Ok(())
+        })?;
+        Ok(())
+    }
+
     /// Renders view `view` of the scene at its picture's size, at the current step; other views than those trained with by the appearance
     /// code zero, since the mean of the others is taken when training is over ([`trained`]).
     pub fn render(
@@ -291,6 +306,7 @@ impl Trainer {
         appearance: u32,
         keep_going: &mut dyn FnMut(f64) -> bool,
     ) -> Result<Rendered> {
+        self.catch_up()?;
         let shot = Shot {
             views: &self.views,
             view: row,
@@ -310,6 +326,7 @@ impl Trainer {
     pub fn gpu(&self) -> &Gpu {
         &self.gpu
     }
+    /// The model; its parameters are those of all steps done after [`Trainer::catch_up`].
     pub fn model(&self) -> &Model {
         &self.model
     }

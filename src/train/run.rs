@@ -234,6 +234,7 @@ impl Trainer {
     /// # Errors
     /// [`Error::Output`] if it cannot be written; what reading device memory fails with.
     pub fn save(&self, folder: &Path) -> Result<PathBuf> {
+        self.catch_up()?;
         self.gpu.finish()?;
         let state = State {
             step: self.step,
@@ -287,6 +288,12 @@ impl Trainer {
         for (tensor, buffer, first) in parts.into_iter().take(n_tensors) {
             checkpoint.read(&tensor, &mut |offset, numbers| {
                 self.gpu.upload(buffer, first + offset, numbers)
+            })?;
+        }
+        if let Some(table) = &self.model.table {
+            self.gpu.submit("reset", |rec| {
+                table.reset(rec);
+                Ok(())
             })?;
         }
         self.gpu.finish()

@@ -1,6 +1,9 @@
 //! Every kernel against a slow twin in float64, and against arrays of the published implementation.
 
 mod harness;
+mod lazy_table;
+#[path = "../reference/optimizer.rs"]
+mod optimizer;
 mod volume_compositing;
 mod volume_golden;
 mod volume_losses;

@@ -95,6 +95,8 @@ impl Rig {
 
     /// Rounds the twin's parameters to float32 and puts them on the device.
     pub fn upload_parameters(&self, params: &mut BTreeMap<String, Vec<f64>>) -> Result<()> {
+        // What entries are behind with belongs to what stood there.
+        self.trainer.catch_up()?;
         let block = &self.trainer.model().params;
         let spans = || block.spans().iter().filter(|span| !span.is_empty());
         for span in spans() {
@@ -116,6 +118,7 @@ impl Rig {
 
     /// A buffer shaped like the parameter block, by the twin's spans.
     pub fn download_spans(&self, block: &Buffer<f32>) -> Result<BTreeMap<String, Vec<f64>>> {
+        self.trainer.catch_up()?;
         let mut spans = BTreeMap::new();
         let block_spans = self.trainer.model().params.spans();
         for span in block_spans.iter().filter(|span| !span.is_empty()) {

@@ -129,6 +129,15 @@ fn outdoors_with_a_background_field_and_appearance_codes() -> Result<()> {
     check(config, RegionShape::Sphere, 9, false)
 }
 
+/// Large enough for a table of which a step leaves a part alone.
+#[test]
+fn outdoors_with_a_table_that_is_updated_in_part() -> Result<()> {
+    let mut config = preset("outdoor-tiny");
+    config.hash.features = 4;
+    config.hash.log2_size = 17;
+    check(config, RegionShape::Sphere, 9, false)
+}
+
 #[test]
 fn with_the_widths_of_the_large_configurations() -> Result<()> {
     let mut config = preset("outdoor-large");

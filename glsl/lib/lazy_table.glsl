@@ -1,0 +1,62 @@
+// A hash table under AdamW of which a step only changes the entries that it needs, and which still is what AdamW makes of it.
+//
+// A clock counts updates; an entry's stamp is the clock's reading when the entry last stood where AdamW would have it. An update without
+// gradient is linear in an entry's parameter and moments as long as ε is small against √v. So k of them are, with m and v of the stamp,
+//     p ← p − (E p + S m / (√v + ε b)),   m ← β₁ᵏ m,   v ← β₂ᵏ v
+//     E = 1 − Π_j (1 − η_j λ),   S = Σ_j s_j,   s_j = η_j c2_j/c1_j (β₁/√β₂)^j Π_{i>j} (1 − η_i λ),   b = Σ_j s_j c2_j β₂^{−j/2} / S
+// with the bias corrections c1 = 1 − β₁ᵗ, c2 = √(1 − β₂ᵗ). E, S, b and the powers are the same for all entries with one stamp, and stand
+// in a row for each reading. Clock and stamps count modulo 256: nothing is left alone for as many steps (table_update sweeps).
+//
+// A level is marked entry by entry before a step reads it. Where most of it turns out to be needed, it is updated whole, and stays
+// `whole` for some steps, in which it needs neither marks nor stamps.
+#include "lib/adam.glsl"
+
+const uint READINGS = 256u;
+
+// What entries stamped with a row's reading have missed; and the update that ended with this reading.
+struct Lag {
+    float decay;     // E
+    float momentum;  // S
+    float slowing;   // b
+    float first;     // β₁ᵏ
+    float second;    // β₂ᵏ
+    float step_rate;
+    float step_decay;
+    float step_correction;
+};
+layout(buffer_reference, scalar) readonly buffer Lags { Lag at[]; };
+
+struct LevelUse {
+    uint touched;  // entries marked in this step
+    uint whole;    // non-zero: steps for which all entries stay up to date
+};
+layout(buffer_reference, scalar) readonly buffer LevelUses { LevelUse at[]; };
+layout(buffer_reference, scalar) buffer LevelUsesMut { LevelUse at[]; };
+
+// Marks (a bit each) and stamps (a byte each) are kept by slots: entries, but every level begins with a word of marks of its own.
+uint first_slot(Level level, uint l) { return (level.offset / 32u + l) * 32u; }
+
+// Whether so many of a level are marked that its update had better go over all of it.
+bool mostly_touched(Level level, uint touched, float most) { return float(touched) > most * float(level.entries); }
+
+uint stamp_in(uint word, uint slot) { return (word >> (8u * (slot & 3u))) & 255u; }
+
+const Lag NO_LAG = Lag(0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 1.0);
+
+// p of an entry that stands at `stamp`, with its row, as it should be at `now`.
+float caught_up(Moving x, Lag lag, Lags lags, uint stamp, uint now, Rates r) {
+    float slowing = r.epsilon * lag.slowing;
+    float inverse = 1.0 / max(sqrt(x.v) + slowing, 1e-37);
+    float moved = lag.momentum * x.m * inverse;
+    // The mean b stands for all b_j as long as ε is small. What is neglected is (ε b/(√v + ε b))² of the move, times the relative variance
+    // of the b_j: a tenth, if both the first steps and the longest lags are in it. Where that could matter: step by step.
+    float small = slowing * inverse;
+    if (abs(moved) * small * small > 2e-7) {
+        for (uint k = stamp; k != now; k = (k + 1u) % READINGS) {
+            Lag next = lags.at[(k + 1u) % READINGS];
+            x = adam_step(x, 0.0, Rates(next.step_rate, next.step_decay, next.step_correction, r.share1, r.share2, r.epsilon));
+        }
+        return x.p;
+    }
+    return x.p - fma(lag.decay, x.p, moved);
+}

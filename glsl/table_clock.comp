@@ -1,0 +1,68 @@
+#version 460
+// Lets the table's clock go on by an update, after it: what entries of each stamp have missed, and which levels the next steps mark. ONE
+// workgroup, an invocation for each of the clock's readings.
+#define LOCAL_SIZE 256
+#include "lib/prelude.glsl"
+#include "lib/hash_grid.glsl"
+#include "lib/lazy_table.glsl"
+
+layout(constant_id = 0) const uint LEVELS = 12;
+
+layout(buffer_reference, scalar) buffer LagsMut { Lag at[]; };
+
+layout(push_constant, scalar) uniform Args {
+    Levels levels;
+    U32s bad_step;      // [1] non-zero: there was no update
+    LevelUsesMut uses;  // [LEVELS]
+    LagsMut lags;       // [256]
+    U32sMut clock;      // [1]
+    float rate;         // η / (1 − β₁ᵗ)
+    float decay;        // η λ
+    float correction;   // √(1 − β₂ᵗ)
+    float share1;       // 1 − β₁
+    float share2;       // 1 − β₂
+    float most;         // share of a level's entries
+};
+
+// Steps after which a level that was mostly touched is marked again, to see whether it still is.
+const uint WHOLE = 64u;
+
+void main() {
+    uint row = gl_LocalInvocationID.x;
+    uint now = clock.at[0];
+    bool bad = bad_step.at[0] != 0u;
+    barrier();
+    if (row < LEVELS) {
+        LevelUse use = uses.at[row];
+        uint whole = mostly_touched(levels.at[row], use.touched, most) ? WHOLE : 0u;
+        uses.at[row] = LevelUse(0u, use.whole != 0u ? use.whole - 1u : whole);
+    }
+    if (bad) return;
+    uint next = (now + 1u) % READINGS;
+    if (row == 0u) clock.at[0] = next;
+    Lag lag = lags.at[row];
+    if (row == next) {
+        lag.step_rate = rate;
+        lag.step_decay = decay;
+        lag.step_correction = correction;
+    } else {
+        // Who stands at the clock has missed nothing yet.
+        if (row == now) {
+            lag.decay = 0.0;
+            lag.momentum = 0.0;
+            lag.slowing = 0.0;
+            lag.first = 1.0;
+            lag.second = 1.0;
+        }
+        lag.first -= share1 * lag.first;
+        lag.second -= share2 * lag.second;
+        float root = sqrt(lag.second);
+        float kept = lag.momentum - decay * lag.momentum;
+        float added = rate * correction * lag.first / root;
+        float slowed = kept * lag.slowing + added * correction / root;
+        lag.decay += decay - decay * lag.decay;
+        lag.momentum = kept + added;
+        lag.slowing = lag.momentum > 0.0 ? slowed / lag.momentum : 0.0;
+    }
+    lags.at[row] = lag;
+}

@@ -1,0 +1,40 @@
+#version 460
+// Brings every entry of the hash table up to date, for whoever reads all of it, one parameter of a level (the slice) per invocation.
+// Stamps and marks are the caller's to clear.
+#include "lib/prelude.glsl"
+#include "lib/hash_grid.glsl"
+#include "lib/lazy_table.glsl"
+
+layout(constant_id = 0) const uint FEATURES = 2;
+
+layout(push_constant, scalar) uniform Args {
+    Levels levels;
+    LevelUses uses;         // [levels]
+    Lags lags;              // [256]
+    U32s clock;             // [1]
+    U32s marks;             // [slots / 32] a bit each
+    U32s stamps;            // [slots / 4] a byte each
+    F32sMut table;          // [entries, FEATURES]
+    F32sMut first_moment;   // [entries, FEATURES]
+    F32sMut second_moment;  // [entries, FEATURES]
+    float share1;       // 1 − β₁
+    float share2;       // 1 − β₂
+    float epsilon;
+};
+
+void main() {
+    uint l = slice();
+    Level level = levels.at[l];
+    if (item() >= level.entries * FEATURES || uses.at[l].whole != 0u) return;
+    uint i = level.offset * FEATURES + item();
+    uint slot = first_slot(level, l) + item() / FEATURES;
+    uint now = clock.at[0];
+    uint stamp = stamp_in(stamps.at[slot >> 2u], slot);
+    if (stamp == now) return;
+    Moving x = Moving(table.at[i], first_moment.at[i], second_moment.at[i]);
+    bool marked = (marks.at[slot >> 5u] >> (slot & 31u) & 1u) != 0u;
+    Lag lag = lags.at[stamp];
+    if (!marked) table.at[i] = caught_up(x, lag, lags, stamp, now, Rates(0.0, 0.0, 1.0, share1, share2, epsilon));
+    first_moment.at[i] = lag.first * x.m;
+    second_moment.at[i] = lag.second * x.v;
+}

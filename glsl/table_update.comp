@@ -1,0 +1,88 @@
+#version 460
+// AdamW of the hash table: of the marked entries of a level (the slice), or of all where most are marked; levels that are up to date as
+// a whole are table_update_whole's. An invocation walks over the marks of a strip of entries. Gradients and marks are consumed in passing. A step whose loss is not finite changes nothing.
+// Every strip is gone over as a whole once in so many steps, so that no entry is left alone for as long as stamps can count.
+#include "lib/prelude.glsl"
+#include "lib/hash_grid.glsl"
+#include "lib/lazy_table.glsl"
+
+layout(constant_id = 0) const uint FEATURES = 2;
+layout(constant_id = 1) const uint STRIP = 16;  // words of 32 marks: long strips have equally much to do, short ones are many
+
+layout(push_constant, scalar) uniform Args {
+    Levels levels;
+    LevelUses uses;         // [levels]
+    Lags lags;              // [256]
+    U32s clock;             // [1]
+    U32s bad_step;          // [1] non-zero: losses not finite
+    F32sMut table;          // [entries, FEATURES]
+    F32sMut grads;          // [entries, FEATURES] zero where nobody marked
+    F32sMut first_moment;   // [entries, FEATURES]
+    F32sMut second_moment;  // [entries, FEATURES]
+    U32sMut marks;          // [slots / 32] a bit each
+    U32sMut stamps;         // [slots / 4] a byte each
+    float rate;             // η / (1 − β₁ᵗ)
+    float decay;            // η λ
+    float correction;       // √(1 − β₂ᵗ)
+    float share1;         // 1 − β₁
+    float share2;         // 1 − β₂
+    float epsilon;
+    float most;             // share of a level's entries
+    uint step;
+};
+
+const uint SWEEP = 240u;  // steps
+
+uint now, next;
+bool bad;
+Rates rates;
+
+// The update of an entry whose moments are as old as its stamp, and p is too, unless it is marked.
+void update_stale(uint entry, uint slot, bool marked) {
+    uint stamp = stamp_in(stamps.at[slot >> 2u], slot);
+    Lag lag = NO_LAG;
+    if (stamp != now) lag = lags.at[stamp];
+    [[unroll]] for (uint f = 0u; f < FEATURES; ++f) {
+        uint i = entry * FEATURES + f;
+        Moving x = Moving(table.at[i], first_moment.at[i], second_moment.at[i]);
+        if (!marked) x.p = caught_up(x, lag, lags, stamp, now, rates);
+        x.m *= lag.first;
+        x.v *= lag.second;
+        float g = grads.at[i];
+        if (marked) grads.at[i] = 0.0;
+        if (!bad) x = adam_step(x, g, rates);
+        table.at[i] = x.p;
+        first_moment.at[i] = x.m;
+        second_moment.at[i] = x.v;
+    }
+    stamps.at[slot >> 2u] ^= (stamp ^ next) << (8u * (slot & 3u));
+}
+
+void main() {
+    uint l = slice();
+    Level level = levels.at[l];
+    LevelUse use = uses.at[l];
+    if (use.whole != 0u) return;
+    now = clock.at[0];
+    bad = bad_step.at[0] != 0u;
+    next = bad ? now : (now + 1u) % READINGS;
+    rates = Rates(rate, decay, correction, share1, share2, epsilon);
+
+    uint word = item() * STRIP, end = min(word + STRIP, (level.entries + 31u) / 32u);
+    bool all = mostly_touched(level, use.touched, most) || item() / 8u % SWEEP == step % SWEEP;
+    uint marked = 0u, bits = 0u;
+    while (true) {
+        // The next word with something to do.
+        for (; bits == 0u && word < end; ++word) {
+            uint at = first_slot(level, l) / 32u + word;
+            marked = marks.at[at];
+            if (marked != 0u) marks.at[at] = 0u;
+            uint n_entries = min(level.entries - word * 32u, 32u);
+            bits = all ? ~0u >> (32u - n_entries) : marked;
+        }
+        if (bits == 0u) break;
+        uint entry = (word - 1u) * 32u + findLSB(bits);
+        update_stale(level.offset + entry, first_slot(level, l) + entry, (marked & bits & (~bits + 1u)) != 0u);
+        bits &= bits - 1u;
+    }
+}

@@ -1,0 +1,62 @@
+#version 460
+// AdamW of all parameters of those levels of the hash table (the slice) that are up to date as a whole; see table_update for the others.
+#include "lib/prelude.glsl"
+#include "lib/hash_grid.glsl"
+#include "lib/lazy_table.glsl"
+
+layout(constant_id = 0) const uint FEATURES = 2;
+
+layout(push_constant, scalar) uniform Args {
+    Levels levels;
+    LevelUses uses;         // [levels]
+    U32s clock;             // [1]
+    U32s bad_step;          // [1] non-zero: losses not finite
+    F32sMut table;          // [entries, FEATURES]
+    F32sMut grads;          // [entries, FEATURES] consumed
+    F32sMut first_moment;   // [entries, FEATURES]
+    F32sMut second_moment;  // [entries, FEATURES]
+    U32sMut stamps;         // [slots / 4] a byte each
+    float rate;             // η / (1 − β₁ᵗ)
+    float decay;            // η λ
+    float correction;       // √(1 − β₂ᵗ)
+    float share1;           // 1 − β₁
+    float share2;           // 1 − β₂
+    float epsilon;
+};
+
+const uint AT_ONCE = 4u;
+const uint TURNS = 128u;  // parameters of an invocation: few workgroups where there is nothing to do
+
+void main() {
+    uint l = slice();
+    uint whole = uses.at[l].whole;
+    if (whole == 0u) return;
+    Level level = levels.at[l];
+    uint n_params = level.entries * FEATURES, first = group() * LOCAL_SIZE * TURNS + gl_LocalInvocationID.x;
+    bool bad = bad_step.at[0] != 0u;
+    Rates rates = Rates(rate, decay, correction, share1, share2, epsilon);
+    for (uint turn = 0u; turn < TURNS; turn += AT_ONCE) {
+        [[unroll]] for (uint k = 0u; k < AT_ONCE; ++k) {
+            uint j = first + (turn + k) * LOCAL_SIZE;
+            if (j < n_params) {
+                uint i = level.offset * FEATURES + j;
+                float g = grads.at[i];
+                grads.at[i] = 0.0;
+                Moving x = Moving(table.at[i], first_moment.at[i], second_moment.at[i]);
+                if (!bad) x = adam_step(x, g, rates);
+                table.at[i] = x.p;
+                first_moment.at[i] = x.m;
+                second_moment.at[i] = x.v;
+            }
+        }
+    }
+    // The next step marks this level again, and needs its stamps.
+    if (whole == 1u) {
+        uint next = bad ? clock.at[0] : (clock.at[0] + 1u) % READINGS;
+        uint n_words = (level.entries + 3u) / 4u, per_group = LOCAL_SIZE * TURNS / FEATURES / 4u;
+        for (uint j = gl_LocalInvocationID.x; j < per_group; j += LOCAL_SIZE) {
+            uint word = group() * per_group + j;
+            if (word < n_words) stamps.at[first_slot(level, l) / 4u + word] = next * 0x01010101u;
+        }
+    }
+}
