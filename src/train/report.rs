@@ -362,6 +362,7 @@ mod tests {
             steps: 100,
             losses: Losses {
                 total: f64::NAN,
+                mask: Some(0.25), // those that are not switched on are not named
                 ..Losses::default()
             },
             psnr: 20.5,
@@ -385,7 +386,8 @@ mod tests {
                 "loss.interlevel",
                 "psnr",
                 "crossing",
-                "it_per_s"
+                "it_per_s",
+                "loss.mask"
             ]
         );
         assert_eq!(record["loss.total"], Value::Null);

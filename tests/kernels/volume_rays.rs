@@ -485,7 +485,7 @@ fn priors_are_drawn_with_their_pixels() {
     let of_views = device.table("priors", &rows);
 
     let n = 60;
-    for view in 0..pictures.len() {
+    for (view, picture) in pictures.iter().enumerate() {
         let mut draws = random.many(3 * n, 0.0, 1.0);
         draws[0] = (view as f64 + 0.5) / views.len() as f64;
         let rays = Rays::room(n);
@@ -509,13 +509,13 @@ fn priors_are_drawn_with_their_pixels() {
                 n: n as u32,
             },
         );
-        let camera = &pictures[view].camera;
+        let camera = &picture.camera;
         let along = |draw: f64, size: u32| ((draw as f32 * size as f32) as u32).min(size - 1);
         let want = |ray: usize| -> [f64; 6] {
             let column = along(draws[n + ray], camera.width);
             let row = along(draws[2 * n + ray], camera.height);
             let at = |kind: usize, channel: u32| {
-                let (width, height) = sizes(&pictures[view])[kind];
+                let (width, height) = sizes(picture)[kind];
                 let part = |i: u32, to: u32, from: u32| {
                     ((f64::from(i) + 0.5) * f64::from(to) / f64::from(from)).floor() as u32
                 };

@@ -150,7 +150,7 @@ fn sensor_depths_count_where_they_are_known() {
             scale: batch.scale() as f32,
         },
     );
-    let counts = |ray: usize| batch.counts(ray) && ray % 4 != 0;
+    let counts = |ray: usize| batch.counts(ray) && !ray.is_multiple_of(4);
     let error = |ray: usize| batch.cosine(ray) * batch.depth(ray) - batch.priors[5 * n + ray];
     let wanted = |ray: usize| if counts(ray) { error(ray).abs() } else { 0.0 };
     let slope = |ray: usize| match counts(ray) {

@@ -36,6 +36,21 @@ impl Rig {
     /// A trainer on a few small pictures of the built-in scene, under the validation layer, with guard words and poisoned scratch.
     /// `portable`: by the kernels that run everywhere, also where this device has faster ones.
     pub fn new(config: Config, shape: RegionShape, portable: bool) -> Result<Rig> {
+        let supervised = config.loss.is_supervised();
+        Rig::with(config, shape, portable, &mut |scene, folder| {
+            if supervised {
+                add_knowledge(scene, folder);
+            }
+        })
+    }
+
+    /// The same on a scene that `prepare` changes, with files in a folder that lasts as long as this.
+    pub fn with(
+        config: Config,
+        shape: RegionShape,
+        portable: bool,
+        prepare: &mut dyn FnMut(&mut Scene, &Path),
+    ) -> Result<Rig> {
         let folder = tempfile::tempdir().expect("a temporary folder");
         let root = folder.path().join("scene");
         let pictures = SyntheticOptions {
@@ -47,9 +62,7 @@ impl Rig {
         };
         pictures.write(&root, &mut |_, _, _| {})?;
         let mut scene = Scene::open(&root, &SceneOptions::default())?;
-        if config.loss.is_supervised() {
-            add_knowledge(&mut scene, folder.path());
-        }
+        prepare(&mut scene, folder.path());
         let region = Region {
             center: CENTER,
             radius: RADIUS,
@@ -313,22 +326,26 @@ impl Rig {
     }
 }
 
+pub fn write_npy(file: &Path, shape: &[u64], values: &[f64]) {
+    let out = std::fs::File::create(file).expect("a file");
+    let options = npyz::WriteOptions::new().default_dtype().shape(shape);
+    let mut writer = options.writer(out).begin_nd().expect("an array");
+    writer.extend(values).expect("its values");
+    writer.finish().expect("its end");
+}
+
 /// Gives every view an object mask and priors: numbers without a meaning, of other sizes than the picture, some of them unknown.
 fn add_knowledge(scene: &mut Scene, folder: &Path) {
     let random = &mut Random(77);
     let write = |name: &str, shape: &[u64], values: &[f64]| {
         let file = folder.join(name);
-        let out = std::fs::File::create(&file).expect("a file");
-        let options = npyz::WriteOptions::new().default_dtype().shape(shape);
-        let mut writer = options.writer(out).begin_nd().expect("an array");
-        writer.extend(values).expect("its values");
-        writer.finish().expect("its end");
+        write_npy(&file, shape, values);
         Some(file)
     };
     for (index, view) in scene.views.iter_mut().enumerate() {
         let (w, h) = (view.camera.width, view.camera.height);
         let mask = image::GrayImage::from_fn(w, h, |x, y| {
-            let left_out = (x / 4 + y / 3 + index as u32) % 4 == 0;
+            let left_out = (x / 4 + y / 3 + index as u32).is_multiple_of(4);
             image::Luma([if left_out { 0 } else { 255 }])
         });
         let file = folder.join(format!("{index}_mask.png"));
