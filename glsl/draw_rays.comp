@@ -18,12 +18,13 @@ layout(push_constant, scalar) uniform Args {
     uint use_mask;     // 0: every pixel counts
     uint region_shape; // 0: unit sphere, 1: box
     vec3 half_extents; // of the box
+    uint one_view;     // 1: all rays are of the view that the first draw chooses
 };
 
 void main() {
     uint index = item();
     if (index >= n) return;
-    float u = pixel_draws.at[index];
+    float u = pixel_draws.at[one_view != 0u ? 0u : index];
     uint below = 0u, above = n_views - 1u;
     while (below < above) {
         uint middle = (below + above) / 2u;
@@ -31,8 +32,7 @@ void main() {
         else below = middle + 1u;
     }
     View view = views.at[below];
-    uvec2 pixel = uvec2(vec2(pixel_draws.at[n + index], pixel_draws.at[2u * n + index]) * vec2(view.width, view.height));
-    pixel = min(pixel, uvec2(view.width, view.height) - 1u); // the product may round up to the size
+    uvec2 pixel = drawn_pixel(view, pixel_draws, index, n);
     Ray ray = pixel_ray(view, pixel, region_shape, half_extents);
     vec4 wanted = pixel_target(view, pixel, use_mask);
     [[unroll]] for (uint axis = 0u; axis < 3u; axis++) {

@@ -128,6 +128,15 @@ pub enum MaskUse {
     Ignore,
     /// Masked-out pixels carry no loss.
     Exclude,
+    /// They are silhouettes of the object: colour is compared within them, and `loss.mask` wants nothing outside.
+    Foreground,
+}
+
+impl MaskUse {
+    /// Whether masks are read at all; pixels that they leave out have no colour to compare then.
+    pub fn reads(self) -> bool {
+        self != MaskUse::Ignore
+    }
 }
 
 /// The SDF's multi-resolution hash grid.
@@ -322,10 +331,32 @@ pub struct LossConfig {
     pub interlevel: f64,
     /// Tangent-normal consistency (METHOD 4.5); needs the analytic gradient.
     pub tangent: f64,
+    /// Accumulated weight against the object's mask; with `scene.masks = "foreground"`.
+    pub mask: f64,
+    /// Rendered depth against that of a sensor.
+    pub sensor_depth: f64,
+    /// Against monocular estimates, whose scale and shift are unknown; every batch is of one view then.
+    pub mono_depth: f64,
+    /// Rendered normals against monocular ones.
+    pub mono_normal: f64,
     pub curvature: CurvatureConfig,
     pub bias: BiasConfig,
     /// Lower bound of 1/β from `start` to `end` over `steps` schedule steps.
     pub scale_bound: ScaleBound,
+}
+
+impl LossConfig {
+    /// Whether anything but colour is wanted of a ray.
+    pub fn is_supervised(&self) -> bool {
+        [
+            self.mask,
+            self.sensor_depth,
+            self.mono_depth,
+            self.mono_normal,
+        ]
+        .iter()
+        .any(|&weight| weight > 0.0)
+    }
 }
 
 /// Mean |trace of the SDF's Hessian|, from taps (METHOD 11).

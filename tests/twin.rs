@@ -120,6 +120,31 @@ fn indoors() -> Step {
     step
 }
 
+/// With losses on masks, depths and normals, in both stages.
+#[test]
+fn gradients_of_what_is_wanted_besides_colour() {
+    let step = trial::supervised(trial::step(trial::config(), 24, 1), 41);
+    check_gradients(step.clone(), &Stage::first(), 42);
+    let stage = trial::second_stage(&step, 43);
+    check_gradients(step, &stage, 44);
+    let step = trial::supervised(indoors(), 45);
+    check_gradients(step, &Stage::first(), 46);
+}
+
+/// The scale and shift of a monocular depth are those of least squares: another scale and shift of the prior changes the loss by that
+/// scale's square, and nothing else.
+#[test]
+fn monocular_depths_have_no_unit() {
+    let step = trial::supervised(trial::step(trial::config(), 24, 47), 48);
+    let loss = step.run().losses["mono_depth"];
+    let mut other = step;
+    for known in &mut other.rays.supervision.known {
+        known.mono_depth = 3.0 * known.mono_depth - 7.0;
+    }
+    let ratio = other.run().losses["mono_depth"] / loss;
+    assert!((ratio - 9.0).abs() < 1e-9, "{ratio}");
+}
+
 /// What the other methods are made of, in combinations that differ in everything.
 #[test]
 fn gradients_of_other_methods() {

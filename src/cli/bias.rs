@@ -132,14 +132,20 @@ struct Measured {
     name: &'static str,
     run: PathBuf,
     step: u64,
-    /// Per view its name, size and the distances of its rays, row by row.
-    views: Vec<(String, (u32, u32), Vec<Option<f64>>)>,
+    views: Vec<ViewBias>,
+}
+
+/// One view: its rays' distances, row by row.
+struct ViewBias {
+    name: String,
+    size: (u32, u32),
+    distances: Vec<Option<f64>>,
 }
 
 impl Measured {
     /// Distances of the rays that meet the surface, in ascending order.
     fn sorted(&self) -> Vec<f64> {
-        let rays = self.views.iter().flat_map(|(.., distances)| distances);
+        let rays = self.views.iter().flat_map(|view| &view.distances);
         let mut met: Vec<f64> = rays.copied().flatten().collect();
         met.sort_by(f64::total_cmp);
         met
@@ -192,11 +198,11 @@ fn compare(
         let mut pictures = Vec::new();
         if let Some(out) = &args.out {
             std::fs::create_dir_all(out).map_err(|e| Error::io(out.clone(), e))?;
-            for (view, size, distances) in &of.views {
-                let path = out.join(format!("{view}.{}.bias.png", of.name));
+            for view in &of.views {
+                let path = out.join(format!("{}.{}.bias.png", view.name, of.name));
                 let failed =
                     |e| Error::output(&path, format!("cannot be written: {e}"), "make room there");
-                picture(distances, *size, limit)
+                picture(&view.distances, view.size, limit)
                     .save(&path)
                     .map_err(failed)?;
                 pictures.push(path);
@@ -251,11 +257,11 @@ fn measure(
             !interrupted.load(Ordering::SeqCst)
         })?;
         let camera = &scene.views[view].camera;
-        measured.push((
-            names[view].clone(),
-            (camera.width, camera.height),
+        measured.push(ViewBias {
+            name: names[view].clone(),
+            size: (camera.width, camera.height),
             distances,
-        ));
+        });
     }
     Ok(Measured {
         name,

@@ -1,6 +1,6 @@
 //! Ranges: which settings the kernels and the method accept. Each complaint gives key, value and range.
 
-use super::{BackgroundKind, Config, GradientKind, MultiStep, ScaleBound, ScaleKind};
+use super::{BackgroundKind, Config, GradientKind, MaskUse, MultiStep, ScaleBound, ScaleKind};
 use crate::{Error, Result};
 use std::fmt::Display;
 
@@ -122,6 +122,17 @@ impl Config {
         let loss = &self.loss;
         wrong.real("loss.eikonal", loss.eikonal, 0.0, 1e3);
         wrong.real("loss.interlevel", loss.interlevel, 0.0, 1e3);
+        wrong.real("loss.mask", loss.mask, 0.0, 1e3);
+        wrong.real("loss.sensor_depth", loss.sensor_depth, 0.0, 1e3);
+        wrong.real("loss.mono_depth", loss.mono_depth, 0.0, 1e6);
+        wrong.real("loss.mono_normal", loss.mono_normal, 0.0, 1e3);
+        if loss.mask > 0.0 && self.scene.masks != MaskUse::Foreground {
+            wrong.add(
+                "loss.mask",
+                loss.mask,
+                "0 where scene.masks is not \"foreground\"",
+            );
+        }
         wrong.real("stage2.eikonal", self.stage2.eikonal, 0.0, 1e3);
         wrong.real("loss.bias.weight", loss.bias.weight, 0.0, 1e3);
         wrong.real("loss.bias.weight_start", loss.bias.weight_start, 0.0, 1e3);

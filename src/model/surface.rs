@@ -510,10 +510,11 @@ impl Surface {
     }
 
     /// Whether the SDF's gradient hears from elsewhere than shading: an analytic one may hear from other losses, any from a density that
-    /// is a function of it.
+    /// is a function of it and from a loss on rendered normals.
     pub fn gradient_is_heard(config: &Config) -> bool {
         config.surface.gradient == GradientKind::Analytic
             || config.surface.density != DensityKind::Laplace
+            || config.loss.mono_normal > 0.0
     }
 
     /// The SDF's gradient at the samples, `[3, n]`.

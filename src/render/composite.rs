@@ -7,7 +7,8 @@ use crate::Result;
 use crate::config::{BackgroundKind, Config, DensityKind, ScaleKind};
 use crate::gpu::{Buffer, Gpu, Kernel, Recorder, Work};
 use crate::kernels::{
-    composite_backward, composite_forward, normal_map, optical_depth, optical_depth_backward,
+    composite_backward, composite_forward, normal_map, normal_map_backward, optical_depth,
+    optical_depth_backward,
 };
 use crate::model::{BackgroundBuffers, Model, Surface, SurfaceBuffers};
 
@@ -19,6 +20,8 @@ pub struct Composite {
     forward: Kernel<composite_forward::Args>,
     backward: Kernel<composite_backward::Args>,
     normal_map: Kernel<normal_map::Args>,
+    /// Where a loss hears of normals.
+    normal_map_backward: Option<Kernel<normal_map_backward::Args>>,
     optical_depth: Buffer<f32>, // [n_rays, n_samples]
     optical_depth_forward: Kernel<optical_depth::Args>,
     optical_depth_backward: Kernel<optical_depth_backward::Args>,
@@ -51,8 +54,14 @@ impl Composite {
             image: gpu.scratch("image", 6 * n)?,
             normals: gpu.scratch("normals", 3 * n)?,
             forward: gpu.kernel(composite_forward::Shape::default())?,
-            backward: gpu.kernel(composite_backward::Shape::default())?,
+            backward: gpu.kernel(composite_backward::Shape {
+                supervised: u32::from(config.loss.is_supervised()),
+            })?,
             normal_map: gpu.kernel(shading)?,
+            normal_map_backward: match config.loss.mono_normal > 0.0 {
+                true => Some(gpu.kernel(normal_map_backward::Shape::default())?),
+                false => None,
+            },
             optical_depth: gpu.scratch("optical depth", n * samples)?,
             optical_depth_forward: gpu.kernel(optical_depth::Shape { density, scale })?,
             optical_depth_backward: gpu.kernel(optical_depth_backward::Shape {
@@ -105,9 +114,16 @@ impl Composite {
         rec.run(&self.forward, per_ray(n, n_samples), args);
     }
 
-    /// Gradients of SDF (block 0), scale, colour and background, and where the density reads it, of the SDF's gradient, from
-    /// `d_color [3, n_rays]`.
-    pub fn backward(&self, rec: &mut Recorder, look: &Look, model: &Model, d_color: &Buffer<f32>) {
+    /// Gradients of SDF (block 0), scale, colour and background, and where density or rendered normals read it, of the SDF's gradient,
+    /// from `d_color [3, n_rays]` and, where there are such losses, what else a picture hears: `d_image [5, n_rays]`.
+    pub fn backward(
+        &self,
+        rec: &mut Recorder,
+        look: &Look,
+        model: &Model,
+        d_color: &Buffer<f32>,
+        d_image: Option<&Buffer<f32>>,
+    ) {
         let (n, n_samples) = (look.rays.n, look.sampler.n_samples);
         let surface = look.surface;
         let args = composite_backward::Args {
@@ -115,6 +131,11 @@ impl Composite {
             rgb: surface.rgb.ptr(),
             background: look.background.color.ptr(),
             d_color: d_color.ptr(),
+            edges: look.sampler.edges.ptr(),
+            near_far: look.rays.near_far.ptr(),
+            image: self.image.ptr(),
+            gradient: model.surface.gradient(surface),
+            d_image: d_image.unwrap_or(d_color).ptr(), // not read where there is none
             // Left where the SDF's own gradient will take its place.
             d_optical_depth: surface.d_sdf.ptr_mut(),
             d_rgb: surface.d_rgb.ptr_mut(),
@@ -143,6 +164,18 @@ impl Composite {
             outside_empty: self.outside_empty,
         };
         rec.run(&self.optical_depth_backward, per_sample(n, n_samples), args);
+        // Added to what optical_depth_backward wrote.
+        if let (Some(kernel), Some(d_image)) = (&self.normal_map_backward, d_image) {
+            let args = normal_map_backward::Args {
+                weights: self.weights.ptr(),
+                gradient: model.surface.gradient(surface),
+                d_image: d_image.ptr(),
+                d_gradient: model.surface.d_gradient(surface),
+                n_rays: n,
+                n_samples,
+            };
+            rec.run(kernel, per_sample(n, n_samples), args);
+        }
     }
 
     /// Rendered normals, into `self.normals`.

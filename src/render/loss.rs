@@ -1,6 +1,8 @@
-//! What is wrong with a batch: colour, eikonal, interlevel and bias losses, their sums for the log (METHOD 4).
+//! What is wrong with a batch: colour, eikonal, interlevel, bias and optional losses, their sums for the log (METHOD 4).
 
 use super::composite::{Composite, Look};
+use super::priors::Priors;
+use super::supervision::Supervision;
 use super::tangent::Tangent;
 use crate::Result;
 use crate::config::{BiasReduction, Config};
@@ -8,8 +10,8 @@ use crate::gpu::{Buffer, Gpu, Kernel, Ptr, Recorder, Work};
 use crate::kernels::{LossTerm, bias_correction, color_loss, heaviest_sample, sum_losses};
 use crate::model::{FieldBuffers, Model, Scratch, Surface};
 
-/// Names of the summed terms, in order; the total of the first seven follows as the last number.
-pub const TERMS: [&str; 9] = [
+/// Names of the summed terms, in order; the total of all but the last two, which are figures for the log, follows as the last number.
+pub const TERMS: [&str; 13] = [
     "color",
     "eikonal",
     "interlevel_0",
@@ -17,6 +19,10 @@ pub const TERMS: [&str; 9] = [
     "bias",
     "tangent",
     "curvature",
+    "mask",
+    "sensor_depth",
+    "mono_depth",
+    "mono_normal",
     "mse",
     "crossing",
 ];
@@ -37,6 +43,7 @@ pub struct Loss {
     query_sdf: Buffer<f32>,   // [2, n_rays]
     d_query_sdf: Buffer<f32>, // [2, n_rays]
     pub tangent: Option<Tangent>,
+    pub supervision: Option<Supervision>,
     terms: Buffer<LossTerm>,
     color_loss: Kernel<color_loss::Args>,
     heaviest_sample: Kernel<heaviest_sample::Args>,
@@ -59,8 +66,8 @@ pub struct LossScales {
 }
 
 impl Loss {
-    /// Buffers and kernels for a batch of rays.
-    pub fn new(gpu: &Gpu, config: &Config, n_rays: u32) -> Result<Loss> {
+    /// Buffers and kernels for a batch of rays, with the priors that its losses ask for.
+    pub fn new(gpu: &Gpu, config: &Config, n_rays: u32, priors: Option<Priors>) -> Result<Loss> {
         let n = u64::from(n_rays);
         let bias = &config.loss.bias;
         Ok(Loss {
@@ -84,6 +91,7 @@ impl Loss {
             query_sdf: gpu.scratch("bias sdf", 2 * n)?,
             d_query_sdf: gpu.scratch("bias d_sdf", 2 * n)?,
             tangent: Tangent::new(gpu, config, n_rays * config.sampling.samples)?,
+            supervision: Supervision::new(gpu, config, n_rays, priors)?,
             terms: gpu.buffer("loss terms", TERMS.len() as u64)?,
             color_loss: gpu.kernel(color_loss::Shape::default())?,
             heaviest_sample: gpu.kernel(heaviest_sample::Shape::default())?,
@@ -201,6 +209,14 @@ impl Loss {
         };
         let n = self.n_rays;
         let n_all = n * self.n_samples;
+        let none = term(self.bias.ptr(), 0, 0.0, 1);
+        let [mask, sensor_depth, mono_depth, mono_normal] = match &self.supervision {
+            Some(supervision) => supervision.terms().map(|of| match of {
+                Some((values, scale)) => term(values.ptr(), n, scale, 1),
+                None => none,
+            }),
+            None => [none; 4],
+        };
         let terms = [
             term(self.color.ptr(), n, per_ray, 1),
             term(eikonal.ptr(), n_all, weights.eikonal / n_all as f32, 1),
@@ -209,12 +225,16 @@ impl Loss {
             term(self.bias.ptr(), n, 1.0, 1), // weighted where it is computed: its weight changes with time
             match &self.tangent {
                 Some(tangent) => term(tangent.loss.ptr(), n_all, weights.tangent / n_all as f32, 1),
-                None => term(self.bias.ptr(), 0, 0.0, 1),
+                None => none,
             },
             match curvature {
                 Some(curvature) => term(curvature.ptr(), n_all, 1.0, 1), // weighted likewise
-                None => term(self.bias.ptr(), 0, 0.0, 1),
+                None => none,
             },
+            mask,
+            sensor_depth,
+            mono_depth,
+            mono_normal,
             term(self.square.ptr(), n, per_ray, 0),
             term(self.gate.ptr(), n, per_ray, 0),
         ];

@@ -3,7 +3,7 @@
 use glam::{DMat4, DVec3};
 
 use crate::Result;
-use crate::config::{Config, GradientKind, MaskUse};
+use crate::config::{Config, GradientKind};
 use crate::gpu::{Buffer, Gpu, Kernel, Ptr, Recorder, Work};
 use crate::kernels::{self, draw_rays, draw_uniforms, view_rays};
 use crate::model::Background;
@@ -68,6 +68,11 @@ impl ViewTable {
             n_training,
             border_color: borders.commonest(),
         })
+    }
+
+    /// The device's table, training views first.
+    pub fn table(&self) -> Ptr<kernels::View> {
+        self.table.ptr()
     }
 
     /// The commonest colour along the borders of the training pictures, in [0, 1].
@@ -221,6 +226,8 @@ pub struct Rays {
     region_shape: u32,
     half_extents: [f32; 3],
     use_mask: u32,
+    /// 1: a batch is of one view.
+    one_view: u32,
 }
 
 impl Rays {
@@ -243,11 +250,13 @@ impl Rays {
             through: gpu.kernel(view_rays::Shape::default())?,
             region_shape,
             half_extents: half.as_vec3().to_array(),
-            use_mask: u32::from(config.scene.masks == MaskUse::Exclude),
+            use_mask: u32::from(config.scene.masks.reads()),
+            // The scale and shift of a monocular depth are those of its picture.
+            one_view: u32::from(config.loss.mono_depth > 0.0),
         })
     }
 
-    /// Rays through pixels drawn uniformly over all training pictures.
+    /// Rays through pixels drawn uniformly over all training pictures, or over one of them drawn in proportion to its pixels.
     pub fn draw(&self, rec: &mut Recorder, views: &ViewTable, draws: &RayDraws) {
         let args = draw_rays::Args {
             views: views.table.ptr(),
@@ -264,6 +273,7 @@ impl Rays {
             use_mask: self.use_mask,
             region_shape: self.region_shape,
             half_extents: self.half_extents,
+            one_view: self.one_view,
         };
         rec.run(
             &self.draw,

@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 use glam::{DMat4, DQuat, DVec3};
 
 use super::json::file_name;
-use super::{Camera, CameraModel, Format, Frame, FrameLens, Point, Reading, Skipped};
+use super::{Camera, CameraModel, Format, Frame, FrameLens, Point, PriorPaths, Reading, Skipped};
 use crate::{Error, Result};
 
 /// Where a model may lie below a dataset's directory.
@@ -108,6 +108,7 @@ pub(super) fn read(path: &Path, model: &Path) -> Result<Reading> {
             lens: FrameLens::Stated(camera.clone()),
             world_from_camera: image.world_from_camera,
             split: None,
+            priors: PriorPaths::default(),
             name: image.name,
         });
     }

@@ -53,7 +53,7 @@ fn turns_sideways(orientation: Orientation) -> bool {
 }
 
 /// Whether two sizes differ by one factor, up to a pixel of rounding in the smaller.
-fn proportional(a: (u32, u32), b: (u32, u32)) -> bool {
+pub(super) fn proportional(a: (u32, u32), b: (u32, u32)) -> bool {
     let (a, b) = if a.0 <= b.0 { (a, b) } else { (b, a) };
     let factor = f64::from(b.0) / f64::from(a.0);
     (f64::from(b.1) / factor - f64::from(a.1)).abs() <= 1.0 + 0.5 * f64::from(a.1) / f64::from(a.0)

@@ -17,6 +17,7 @@ mod mvsnet;
 mod neus;
 mod points;
 mod preview;
+mod priors;
 mod sdfstudio;
 pub mod synthetic;
 mod transforms;
@@ -35,6 +36,7 @@ pub use bounds::{Facing, Looks, Region, RegionOverrides, RegionShape};
 pub use camera::{Camera, CameraModel, UNSUPPORTED_MODELS};
 pub use images::Picture;
 pub use preview::write_preview;
+pub use priors::{ObjectMasks, Prior, PriorKind, PriorPaths};
 pub use sdfstudio::truth_from_world;
 
 /// A dataset: posed views, sparse points where it has any, and what its author said of the region.
@@ -103,6 +105,7 @@ pub struct View {
     pub image_path: PathBuf,
     /// White (or 1) where the picture counts; for instant-ngp's `dynamic_mask_*` the reverse.
     pub mask_path: Option<PathBuf>,
+    pub priors: PriorPaths,
     /// Lens and raster of the picture as [`Scene::load_picture`] gives it, that is after down-scaling.
     pub camera: Camera,
     pub world_from_camera: DMat4,
@@ -199,6 +202,7 @@ struct Frame {
     image: std::result::Result<PathBuf, String>,
     /// The mask that the dataset names, or where it was looked for.
     mask: Option<std::result::Result<PathBuf, String>>,
+    priors: PriorPaths,
     lens: FrameLens,
     world_from_camera: DMat4,
     split: Option<Split>,
@@ -297,6 +301,7 @@ impl Scene {
                 name: frame.name,
                 image_path,
                 mask_path,
+                priors: frame.priors,
                 camera,
                 world_from_camera: frame.world_from_camera,
                 split: frame.split.unwrap_or(Split::Train),

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 
 use glam::DMat4;
 
-use super::{Format, Frame, FrameLens, Reading, Skipped};
+use super::{Format, Frame, FrameLens, PriorPaths, Reading, Skipped};
 use crate::{Error, Result};
 
 const IMAGE_FOLDERS: [&str; 3] = ["images", "image", "blended_images"];
@@ -56,6 +56,7 @@ pub(super) fn read(path: &Path, cameras: &Path) -> Result<Reading> {
             lens: FrameLens::Pinhole(lengths),
             world_from_camera,
             split: None,
+            priors: PriorPaths::default(),
         });
     }
     let without_camera = images.values().map(|image| Skipped {

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use glam::{DMat3, DMat4, DVec3};
 
 use super::json::file_name;
-use super::{Format, Frame, FrameLens, Reading, RegionHint};
+use super::{Format, Frame, FrameLens, PriorPaths, Reading, RegionHint};
 use crate::arrays::Arrays;
 use crate::{Error, Result};
 
@@ -69,6 +69,7 @@ pub(super) fn read(file: &Path) -> Result<Reading> {
             lens: FrameLens::Pinhole([fx, fy, cx + 0.5, cy + 0.5]),
             world_from_camera: super::opengl_from_opencv(world_from_camera),
             split: None,
+            priors: PriorPaths::default(),
         });
     }
     let region_hint = unit_sphere(file, &mut arrays, cameras, &mut notes)?;

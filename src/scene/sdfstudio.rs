@@ -9,11 +9,10 @@ use glam::{DMat3, DMat4, DVec3};
 use serde_json::Value;
 
 use super::json::{Document, ENDINGS, Object, brief, file_name, find};
-use super::{Camera, CameraModel, Format, Frame, FrameLens, Reading, RegionHint};
+use super::{
+    Camera, CameraModel, Format, Frame, FrameLens, PriorKind, PriorPaths, Reading, RegionHint,
+};
 use crate::{Error, Result};
-
-/// Keys of a frame that name priors, which are not read.
-const PRIORS: [&str; 3] = ["mono_depth_path", "mono_normal_path", "sensor_depth_path"];
 
 /// Reads `file`.
 pub(super) fn read(file: &Path) -> Result<Reading> {
@@ -28,13 +27,15 @@ pub(super) fn read(file: &Path) -> Result<Reading> {
         .map(|(index, entry)| document.frame(&root, index, entry, size))
         .collect::<Result<Vec<_>>>()?;
     let mut notes = Vec::new();
-    for key in PRIORS {
-        let named = entries
-            .iter()
-            .filter(|entry| entry.get(key).is_some_and(Value::is_string))
+    for kind in PriorKind::ALL {
+        let named = (frames.iter())
+            .filter(|frame| frame.priors.of(kind).is_some())
             .count();
         if named > 0 {
-            notes.push(format!("{key} of {named} frames is not used"));
+            let (key, setting) = (kind.key(), kind.setting());
+            notes.push(format!(
+                "{key} of {named} frames is used where {setting} is above 0"
+            ));
         }
     }
     if truth_from_world.is_some() {
@@ -140,8 +141,14 @@ impl Document<'_> {
             .get("foreground_mask")
             .and_then(Value::as_str)
             .map(|mask| find(root, mask, &[]));
+        // A file that is not there is missed when it is read: most runs do without.
+        let prior = |kind: PriorKind| {
+            let stated = entry.get(kind.key()).and_then(Value::as_str)?;
+            Some(find(root, stated, &[]).unwrap_or_else(|_| root.join(stated)))
+        };
         Ok(Frame {
             image: find(root, path, &ENDINGS),
+            priors: PriorPaths(PriorKind::ALL.map(prior)),
             mask,
             lens,
             world_from_camera: super::opengl_from_opencv(pose),

@@ -13,7 +13,7 @@ use glam::{DMat4, DVec3};
 use serde_json::Value;
 
 use super::json::{Document, ENDINGS, brief, file_name, find};
-use super::{Format, Frame, FrameLens, Reading, RegionHint, Skipped, Split, points};
+use super::{Format, Frame, FrameLens, PriorPaths, Reading, RegionHint, Skipped, Split, points};
 use crate::Result;
 
 pub(super) use intrinsics::Intrinsics;
@@ -157,6 +157,7 @@ impl Document<'_> {
                 lens: FrameLens::Keys(self.intrinsics(entry, &place)?),
                 world_from_camera: self.pose(matrix, "transform_matrix", &place)?,
                 split: None,
+                priors: PriorPaths::default(),
                 name,
             });
         }

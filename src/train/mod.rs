@@ -11,13 +11,13 @@ pub mod trained;
 use glam::DMat4;
 
 use crate::Result;
-use crate::config::{AppearanceAtEval, Config};
+use crate::config::{AppearanceAtEval, Config, MaskUse};
 use crate::gpu::{Gpu, Readback, Recorder, Ticket};
 use crate::model::{Background, Model, Proposal, Scratch, Surface, TapStep};
 use crate::render::{
-    Annealed, Loss, LossScales, Rendered, Renderer, Shot, TERMS, TRAINING, ViewTable,
+    Annealed, Loss, LossScales, Priors, Rendered, Renderer, Shot, TERMS, TRAINING, ViewTable,
 };
-use crate::scene::{Camera, Region, Scene, Split};
+use crate::scene::{Camera, ObjectMasks, Region, Scene, Split};
 use adam::Adam;
 use schedule::{Now, Schedule};
 
@@ -59,7 +59,7 @@ impl Trainer {
     /// Builds the model, uploads the training pictures and allocates everything that a step needs.
     ///
     /// # Errors
-    /// What reading a picture or allocating device memory fails with.
+    /// What reading a picture, a mask or a prior or allocating device memory fails with.
     pub fn new(gpu: &Gpu, scene: &Scene, region: &Region, config: &Config) -> Result<Trainer> {
         let training: Vec<usize> = scene.split(Split::Train).collect();
         let held_out: Vec<usize> = scene.split(Split::Test).collect();
@@ -78,15 +78,19 @@ impl Trainer {
                 .iter()
                 .map(|preview| (preview.camera.clone(), preview.world_from_camera)),
         );
+        let mut masks = ObjectMasks::default();
         let pictures = training.iter().map(|&v| {
-            let view = &scene.views[v];
-            Ok((
-                view.camera.clone(),
-                view.world_from_camera,
-                scene.load_picture(v)?,
-            ))
+            let (view, picture) = (&scene.views[v], scene.load_picture(v)?);
+            if config.scene.masks == MaskUse::Foreground {
+                masks.look(view, &picture)?;
+            }
+            Ok((view.camera.clone(), view.world_from_camera, picture))
         });
         let views = ViewTable::new(gpu, region, pictures, others.iter())?;
+        if config.loss.mask > 0.0 {
+            masks.check(scene)?;
+        }
+        let priors = Priors::new(gpu, config, region, scene, &training)?;
 
         let n_rays = config.rays;
         let model = Model::new(
@@ -97,7 +101,7 @@ impl Trainer {
             true,
         )?;
         let renderer = Renderer::new(gpu, config, &model, region, n_rays)?;
-        let loss = Loss::new(gpu, config, n_rays)?;
+        let loss = Loss::new(gpu, config, n_rays, priors)?;
         let scales = LossScales {
             eikonal: config.loss.eikonal as f32,
             interlevel: config.loss.interlevel as f32,
@@ -160,6 +164,10 @@ impl Trainer {
             self.renderer
                 .rays
                 .draw(rec, &self.views, &self.renderer.draws);
+            if let Some(priors) = self.priors() {
+                let render = &self.renderer;
+                priors.draw(rec, &self.views, &render.rays, &render.draws);
+            }
             self.gradients(rec, &now);
             self.optimizer
                 .update(rec, &self.model, &now, &self.loss.bad_step);
@@ -181,6 +189,11 @@ impl Trainer {
         Ok(())
     }
 
+    /// Depths and normals that are known of the training pictures, where a loss asks for them.
+    fn priors(&self) -> Option<&Priors> {
+        self.loss.supervision.as_ref()?.priors.as_ref()
+    }
+
     /// Losses of the batch of rays and draws that lie in the renderer's buffers, and the gradients of all parameters.
     pub fn gradients(&self, rec: &mut Recorder, now: &Now) {
         let (model, render, loss) = (&self.model, &self.renderer, &self.loss);
@@ -194,11 +207,18 @@ impl Trainer {
         // Loss: its value for the log, its gradient for everything below; a few more points are asked behind the heaviest samples.
         loss.color(rec, &render.composite, &look);
         loss.heaviest(rec, &render.composite, &look);
+        let supervision = loss.supervision.as_ref();
+        if let Some(supervision) = supervision {
+            supervision.run(rec, &self.views, &render.composite, &look);
+        }
         if now.bias_weight > 0.0 {
             loss.bias(rec, model, &self.scratch, now.bias_weight as f32);
         }
         // Backward: the same sentence, right to left.
-        render.composite.backward(rec, &look, model, &loss.d_color);
+        let d_image = supervision.map(|supervision| &supervision.d_image);
+        render
+            .composite
+            .backward(rec, &look, model, &loss.d_color, d_image);
         if let Some(tangent) = &loss.tangent {
             tangent.run(rec, model, &look, &render.draws, &self.scratch);
         }

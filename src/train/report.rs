@@ -28,6 +28,25 @@ pub struct Losses {
     pub bias: f64,
     /// Both proposal levels.
     pub interlevel: f64,
+    /// Those that are switched on.
+    pub mask: Option<f64>,
+    pub sensor_depth: Option<f64>,
+    pub mono_depth: Option<f64>,
+    pub mono_normal: Option<f64>,
+}
+
+impl Losses {
+    /// Names and values of the optional ones that are switched on.
+    pub fn optional(&self) -> impl Iterator<Item = (&'static str, f64)> + use<> {
+        [
+            ("mask", self.mask),
+            ("sensor_depth", self.sensor_depth),
+            ("mono_depth", self.mono_depth),
+            ("mono_normal", self.mono_normal),
+        ]
+        .into_iter()
+        .filter_map(|(name, value)| Some((name, value?)))
+    }
 }
 
 /// Something that happened during a run.
@@ -160,6 +179,10 @@ impl Event {
             unreachable!("written as an object above")
         };
         record.extend(rest);
+        if let Event::Step { losses, .. } = self {
+            let named = losses.optional();
+            record.extend(named.map(|(name, value)| (format!("loss.{name}"), value.into())));
+        }
         record
     }
 }
@@ -339,6 +362,7 @@ mod tests {
             steps: 100,
             losses: Losses {
                 total: f64::NAN,
+                mask: Some(0.25), // those that are not switched on are not named
                 ..Losses::default()
             },
             psnr: 20.5,
@@ -362,7 +386,8 @@ mod tests {
                 "loss.interlevel",
                 "psnr",
                 "crossing",
-                "it_per_s"
+                "it_per_s",
+                "loss.mask"
             ]
         );
         assert_eq!(record["loss.total"], Value::Null);

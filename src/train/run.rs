@@ -82,7 +82,7 @@ impl Trainer {
                 }
                 if step.is_multiple_of(report.log_steps) {
                     pace.mark(step);
-                    stopping |= tell(told(losses, steps, pace.per_second()));
+                    stopping |= tell(told(losses, &self.config, pace.per_second()));
                     if surface.is_lost(share_that_crosses(losses)) {
                         let what = NO_SURFACE.into();
                         stopping |= tell(Event::Warning { step, what });
@@ -117,7 +117,7 @@ impl Trainer {
                     bad.watch(&losses);
                     if last && !step.is_multiple_of(report.log_steps) {
                         pace.mark(step);
-                        tell(told(&losses, steps, pace.per_second()));
+                        tell(told(&losses, &self.config, pace.per_second()));
                     }
                 }
                 // What made the losses bad may be in the parameters: the last checkpoint from before it must stay the newest.
@@ -423,7 +423,7 @@ fn side_by_side(rendered: &Rendered, photo: &RgbaImage) -> RgbImage {
 }
 
 /// A finished step's losses as an event.
-fn told(losses: &StepLosses, steps: u64, it_per_s: f64) -> Event {
+fn told(losses: &StepLosses, config: &Config, it_per_s: f64) -> Event {
     let of = |wanted: &str| -> f64 {
         TERMS
             .iter()
@@ -432,15 +432,21 @@ fn told(losses: &StepLosses, steps: u64, it_per_s: f64) -> Event {
             .map(|(_, value)| f64::from(*value))
             .sum()
     };
+    let optional = |weight: f64, name: &str| (weight > 0.0).then(|| of(name));
+    let weights = &config.loss;
     Event::Step {
         step: losses.step + 1,
-        steps,
+        steps: config.total_steps(),
         losses: Losses {
             total: f64::from(losses.values[TERMS.len()]),
             color: of("color"),
             eikonal: of("eikonal"),
             bias: of("bias"),
             interlevel: of("interlevel"),
+            mask: optional(weights.mask, "mask"),
+            sensor_depth: optional(weights.sensor_depth, "sensor_depth"),
+            mono_depth: optional(weights.mono_depth, "mono_depth"),
+            mono_normal: optional(weights.mono_normal, "mono_normal"),
         },
         psnr: -10.0 * of("mse").log10(),
         crossing: f64::from(share_that_crosses(losses)),

@@ -1,6 +1,6 @@
 //! Where a run keeps what it makes: a folder with `config.toml`, `scene.json`, `log.jsonl`, `previews/` and `ckpt/`.
 
-use crate::config::{Config, MaskUse};
+use crate::config::Config;
 use crate::scene::{Format, Region, Scene, SceneOptions, Split};
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
@@ -221,7 +221,7 @@ pub fn scene_options(config: &Config) -> SceneOptions {
     SceneOptions {
         downscale: config.scene.downscale,
         holdout: config.scene.holdout,
-        masks: config.scene.masks == MaskUse::Exclude,
+        masks: config.scene.masks.reads(),
     }
 }
 

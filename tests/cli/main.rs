@@ -299,6 +299,62 @@ fn unusable_inputs_exit_3_and_name_the_file() {
     assert!(!Path::new(&out).exists(), "nothing was begun");
 }
 
+/// Losses on more than colour need what they compare with; where they have it, the log names them.
+#[test]
+fn supervision_needs_something_to_go_by() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name).to_str().unwrap().to_string();
+    let (dataset, out) = (path("dataset"), path("run"));
+    write_dataset(Path::new(&dataset));
+    let train = |more: &[&str]| {
+        let words = ["train", &dataset, "--out", &out, "--steps", "12", "--force"];
+        [&words[..], &["--preset", "outdoor-tiny"], &SMALL, more]
+            .concat()
+            .iter()
+            .map(ToString::to_string)
+            .collect::<Vec<String>>()
+    };
+    let refused = |more: &[&str], parts: &[&str]| {
+        let words = train(more);
+        fails(
+            &words.iter().map(String::as_str).collect::<Vec<_>>(),
+            3,
+            parts,
+        )
+    };
+    let mask = ["--set", "loss.mask=0.1"];
+    refused(&mask, &["loss.mask = 0.1", "\"foreground\""]);
+    let silhouettes = [&mask[..], &["--set", "scene.masks=foreground"]].concat();
+    refused(&silhouettes, &["loss.mask", "object masks", "next:"]);
+    refused(
+        &["--set", "loss.mono_normal=0.05"],
+        &["loss.mono_normal", "mono_normal_path", "0 of 9", "next:"],
+    );
+
+    fs::create_dir_all(Path::new(&dataset).join("masks")).unwrap();
+    for view in 0..9 {
+        let disc = image::GrayImage::from_fn(24, 18, |x, y| {
+            let (dx, dy) = (f64::from(x) - 11.5, f64::from(y) - 8.5);
+            image::Luma([if dx * dx + dy * dy < 16.0 { 255 } else { 0 }])
+        });
+        disc.save(format!("{dataset}/masks/view{view}.png"))
+            .unwrap();
+    }
+    let words = train(&[&silhouettes[..], &["--set", "report.log_steps=1"]].concat());
+    let words: Vec<&str> = words.iter().map(String::as_str).collect();
+    let done = said(neurodin(&words).output().unwrap());
+    assert_eq!(done.code, Some(0), "{}", done.stderr);
+    let steps = logged(Path::new(&out), "step");
+    assert!(!steps.is_empty());
+    for step in steps {
+        assert!(
+            step["loss.mask"].as_f64().is_some_and(|loss| loss > 0.0),
+            "{step}"
+        );
+        assert!(step.get("loss.mono_depth").is_none(), "{step}");
+    }
+}
+
 #[test]
 fn outputs_that_exist_exit_8_untouched() {
     let folder = tempfile::tempdir().unwrap();

@@ -9,4 +9,5 @@ mod volume_golden;
 mod volume_losses;
 mod volume_rays;
 mod volume_sampling;
+mod volume_supervision;
 mod volume_twin;

@@ -144,6 +144,11 @@ impl Batch {
                 rgb: rgb.ptr(),
                 background: background.ptr(),
                 d_color: device.put("d_color", d_color).ptr(),
+                edges: edges.ptr(),
+                near_far: near_far.ptr(),
+                image: rgb.ptr(), // this and the next two are not read: nothing but colour is wanted
+                gradient: rgb.ptr(),
+                d_image: rgb.ptr(),
                 d_optical_depth: d[0].ptr_mut(),
                 d_rgb: d[2].ptr_mut(),
                 d_background: d[3].ptr_mut(),

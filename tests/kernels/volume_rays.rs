@@ -227,6 +227,41 @@ impl Rays {
         }
     }
 
+    /// Draws as many as there is room for; without half extents in the unit sphere.
+    fn draw(
+        &self,
+        views: &Buffer<View>,
+        shares: &[f64],
+        draws: &[f64],
+        half: Option<[f64; 3]>,
+        use_mask: u32,
+        one_view: u32,
+    ) {
+        let device = device();
+        let n = self.view.len() as usize;
+        device.run(
+            kernels::draw_rays::Shape::default(),
+            n,
+            kernels::draw_rays::Args {
+                views: views.ptr(),
+                cumulative_share: device.put("shares", shares).ptr(),
+                pixel_draws: device.put("pixel_draws", draws).ptr(),
+                origins: self.origins.ptr_mut(),
+                directions: self.directions.ptr_mut(),
+                near_far: self.near_far.ptr_mut(),
+                ray_view: self.view.ptr_mut(),
+                ray_outside: self.outside.ptr_mut(),
+                target: self.target.ptr_mut(),
+                n: n as u32,
+                n_views: shares.len() as u32,
+                use_mask,
+                region_shape: if half.is_some() { BOX } else { SPHERE },
+                half_extents: half.unwrap_or([1.0; 3]).map(|x| x as f32),
+                one_view,
+            },
+        );
+    }
+
     /// Compares with pixels (picture, column, row) of `pictures`.
     fn check(
         &self,
@@ -327,26 +362,8 @@ fn training_rays() {
 
     for (region_shape, half, use_mask) in [(SPHERE, [0.0; 3], 0), (BOX, [1.0, 0.5, 0.75], 1)] {
         let rays = Rays::room(n);
-        device.run(
-            kernels::draw_rays::Shape::default(),
-            n,
-            kernels::draw_rays::Args {
-                views: table.ptr(),
-                cumulative_share: device.put("shares", &shares).ptr(),
-                pixel_draws: device.put("pixel_draws", &draws).ptr(),
-                origins: rays.origins.ptr_mut(),
-                directions: rays.directions.ptr_mut(),
-                near_far: rays.near_far.ptr_mut(),
-                ray_view: rays.view.ptr_mut(),
-                ray_outside: rays.outside.ptr_mut(),
-                target: rays.target.ptr_mut(),
-                n: n as u32,
-                n_views: views.len() as u32,
-                use_mask,
-                region_shape,
-                half_extents: half.map(|x| x as f32),
-            },
-        );
+        let half = (region_shape == BOX).then_some(half);
+        rays.draw(&table, &shares, &draws, half, use_mask, 0);
         assert_eq!(
             device.read(&rays.view),
             pixels
@@ -354,12 +371,7 @@ fn training_rays() {
                 .map(|pixel| pixel.0 as u32)
                 .collect::<Vec<_>>()
         );
-        rays.check(
-            &pictures,
-            &pixels,
-            (region_shape == BOX).then_some(half),
-            use_mask != 0,
-        );
+        rays.check(&pictures, &pixels, half, use_mask != 0);
     }
     // Every pixel of every picture is as likely as any other: a picture's rays in proportion to its pixels, four standard deviations.
     for (view, picture) in pictures.iter().enumerate() {
@@ -426,6 +438,114 @@ fn rays_of_a_view() {
     }
 }
 
+/// Priors of the pixels of a batch of one view each: what lies where the pixel's middle falls on the prior's own raster.
+#[test]
+fn priors_are_drawn_with_their_pixels() {
+    let device = device();
+    let mut random = Random(13);
+    let pictures = pictures(&mut random);
+    let views: Vec<View> = pictures.iter().map(Picture::view).collect();
+    let table = device.table("views", &views);
+    let shares: Vec<f64> = rounded((1..=views.len()).map(|i| i as f64 / views.len() as f64));
+    // As large as the picture, half as large where that is whole, three times as large; every number occurs once.
+    let sizes = |picture: &Picture| {
+        let (w, h) = (picture.camera.width, picture.camera.height);
+        [(w, h), (w.div_ceil(2), h.div_ceil(2)), (3 * w, 3 * h)]
+    };
+    let map = |(width, height): (u32, u32), channels: u32, first: u32| -> Vec<f64> {
+        let count = f64::from(width * height * channels);
+        (0..count as u32).map(|i| f64::from(first + i)).collect()
+    };
+    let channels = [1, 3, 1];
+    let maps: Vec<[Buffer<f32>; 3]> = (pictures.iter().enumerate())
+        .map(|(view, picture)| {
+            let sizes = sizes(picture);
+            [0, 1, 2].map(|kind| {
+                let first = 10_000 * (view as u32 + 1) + 2_000 * kind as u32;
+                device.put("prior", &map(sizes[kind], channels[kind], first))
+            })
+        })
+        .collect();
+    let rows: Vec<kernels::ViewPriors> = (maps.iter().zip(&pictures))
+        .map(|(maps, picture)| {
+            let [depth, normal, sensor] = sizes(picture);
+            kernels::ViewPriors {
+                mono_depth: maps[0].ptr(),
+                mono_normal: maps[1].ptr(),
+                sensor_depth: maps[2].ptr(),
+                mono_depth_width: depth.0,
+                mono_depth_height: depth.1,
+                mono_normal_width: normal.0,
+                mono_normal_height: normal.1,
+                sensor_depth_width: sensor.0,
+                sensor_depth_height: sensor.1,
+            }
+        })
+        .collect();
+    let of_views = device.table("priors", &rows);
+
+    let n = 60;
+    for (view, picture) in pictures.iter().enumerate() {
+        let mut draws = random.many(3 * n, 0.0, 1.0);
+        draws[0] = (view as f64 + 0.5) / views.len() as f64;
+        let rays = Rays::room(n);
+        rays.draw(&table, &shares, &draws, None, 0, 1);
+        assert_eq!(device.read(&rays.view), vec![view as u32; n], "one view");
+        let priors = device.room("drawn", 6 * n);
+        device.run(
+            kernels::draw_priors::Shape {
+                mono_depth: 1,
+                mono_normal: 1,
+                sensor_depth: 1,
+            },
+            n,
+            kernels::draw_priors::Args {
+                views: table.ptr(),
+                maps: of_views.ptr(),
+                pixel_draws: device.put("pixel_draws", &draws).ptr(),
+                ray_view: rays.view.ptr(),
+                directions: rays.directions.ptr(),
+                priors: priors.ptr_mut(),
+                n: n as u32,
+            },
+        );
+        let camera = &picture.camera;
+        let along = |draw: f64, size: u32| ((draw as f32 * size as f32) as u32).min(size - 1);
+        let want = |ray: usize| -> [f64; 6] {
+            let column = along(draws[n + ray], camera.width);
+            let row = along(draws[2 * n + ray], camera.height);
+            let at = |kind: usize, channel: u32| {
+                let (width, height) = sizes(picture)[kind];
+                let part = |i: u32, to: u32, from: u32| {
+                    ((f64::from(i) + 0.5) * f64::from(to) / f64::from(from)).floor() as u32
+                };
+                let (x, y) = (
+                    part(column, width, camera.width),
+                    part(row, height, camera.height),
+                );
+                let first = 10_000 * (view as u32 + 1) + 2_000 * kind as u32;
+                f64::from(first + (channel * height + y) * width + x)
+            };
+            let direction =
+                camera.direction(DVec2::new(f64::from(column) + 0.5, f64::from(row) + 0.5));
+            [
+                -direction.normalize().z,
+                at(0, 0),
+                at(1, 0),
+                at(1, 1),
+                at(1, 2),
+                at(2, 0),
+            ]
+        };
+        let want: Vec<[f64; 6]> = (0..n).map(want).collect();
+        let got = interleaved::<6>(&device.take(&priors));
+        for (got, want) in got.iter().zip(&want) {
+            assert!((got[0] - want[0]).abs() < 2e-6, "{got:?}, wanted {want:?}");
+            assert_eq!(got[1..], want[1..]);
+        }
+    }
+}
+
 /// (near, far, outside) of rays given as one-pixel pictures, region the unit sphere.
 pub fn near_far_of(
     origins: &[[f64; 3]],
@@ -446,26 +566,7 @@ pub fn near_far_of(
         .map(|i| ((i % n) as f64 + 0.5) / n as f64)
         .collect();
     let rays = Rays::room(n);
-    device.run(
-        kernels::draw_rays::Shape::default(),
-        n,
-        kernels::draw_rays::Args {
-            views: table.ptr(),
-            cumulative_share: device.put("shares", &shares).ptr(),
-            pixel_draws: device.put("pixel_draws", &draws).ptr(),
-            origins: rays.origins.ptr_mut(),
-            directions: rays.directions.ptr_mut(),
-            near_far: rays.near_far.ptr_mut(),
-            ray_view: rays.view.ptr_mut(),
-            ray_outside: rays.outside.ptr_mut(),
-            target: rays.target.ptr_mut(),
-            n: n as u32,
-            n_views: n as u32,
-            use_mask: 0,
-            region_shape: SPHERE,
-            half_extents: [1.0; 3],
-        },
-    );
+    rays.draw(&table, &shares, &draws, None, 0, 0);
     assert_eq!(device.read(&rays.view), (0..n as u32).collect::<Vec<_>>());
     let near_far = device.take(&rays.near_far);
     (

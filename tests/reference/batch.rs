@@ -4,6 +4,7 @@ use super::background::Background;
 use super::hash_grid::Grid;
 use super::losses::BiasReduction;
 use super::sampling::{Region, Stretch};
+use super::supervision::Supervision;
 use super::tape::ReluEdge;
 use std::collections::BTreeMap;
 
@@ -122,6 +123,8 @@ pub struct Rays {
     pub view: Vec<usize>,
     /// Near, far and outside, where they are not to be computed from the region.
     pub stretches: Option<Vec<Stretch>>,
+    /// What is wanted of them besides colour.
+    pub supervision: Supervision,
 }
 
 /// The step's random numbers, raw draws in [0, 1).
@@ -235,7 +238,8 @@ pub struct ActivationGradients {
 
 #[derive(Clone, Debug)]
 pub struct Outcome {
-    /// "color", "eikonal", "interlevel", and of "bias", "tangent", "curvature" those that there are, each with its weight, and their sum "total".
+    /// "color", "eikonal", "interlevel", and of "bias", "tangent", "curvature", "mask", "sensor_depth", "mono_depth", "mono_normal" those
+    /// that there are, each with its weight, and their sum "total".
     pub losses: BTreeMap<String, f64>,
     pub images: Images,
     pub d_images: ActivationGradients,

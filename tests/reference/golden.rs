@@ -142,7 +142,7 @@ pub fn whole_step(npz: &Npz) -> Step {
             .collect(),
         view: vec![0; origins.len()],
         origins,
-        stretches: None,
+        ..Rays::default()
     };
     let jitter = ["draw0_rand", "draw1_rand", "draw2_rand"].map(|draw| npz.values(draw).to_vec());
     let draws = Draws {

@@ -20,6 +20,7 @@ pub mod proposal;
 pub mod sampling;
 pub mod schedule;
 pub mod step;
+pub mod supervision;
 pub mod surface;
 pub mod tape;
 pub mod trial;

@@ -6,6 +6,7 @@ use super::losses;
 use super::networks::{NormedLayer, sigmoid};
 use super::proposal::{self, Proposal};
 use super::sampling::{self, Stretch};
+use super::supervision;
 use super::surface::{self, Surface};
 use super::tape::{Gradients, Tape, Var};
 use super::volume;
@@ -163,6 +164,7 @@ impl Step {
             let loss = surface::curvature(tape, stage.taps, shading.sdf_all, steps);
             named.push(("curvature", tape.scale(loss, now.curvature_weight)));
         }
+        named.extend(self.supervise(tape, weights, gradient, &images));
         let total = named[1..]
             .iter()
             .fold(color, |sum, &(_, loss)| tape.add(sum, loss));
@@ -414,6 +416,45 @@ impl Step {
         let shifted_normals = surface::normals(tape, shifted);
         let loss = losses::tangent(tape, normals, shifted_normals);
         (tape.scale(loss, tangent.weight), points, shifted)
+    }
+
+    /// The losses on masks, depths and normals that there are.
+    fn supervise(
+        &self,
+        tape: &mut Tape,
+        weights: Var,
+        gradient: Var,
+        images: &Images,
+    ) -> Vec<(&'static str, Var)> {
+        let rays = &self.rays;
+        let wanted = &rays.supervision;
+        let meets = |ray: usize| f64::from(u8::from(!images.stretches[ray].outside));
+        let meeting: Vec<f64> = (0..rays.target.len()).map(meets).collect();
+        let masks: Vec<f64> = rays.target.iter().map(|target| target[3]).collect();
+        let counts: Vec<f64> = meeting.iter().zip(&masks).map(|(a, b)| a * b).collect();
+        let mut named = Vec::new();
+        if wanted.mask > 0.0 {
+            let accumulation = supervision::accumulation(tape, weights);
+            let loss = supervision::mask(tape, accumulation, masks, &meeting);
+            named.push(("mask", tape.scale(loss, wanted.mask)));
+        }
+        let midpoints = per_ray(&images.distances[2], rays.target.len(), sampling::midpoints);
+        let depth = supervision::depth(tape, weights, midpoints);
+        if wanted.sensor_depth > 0.0 {
+            let loss = supervision::sensor_depth(tape, depth, &wanted.known, &counts);
+            named.push(("sensor_depth", tape.scale(loss, wanted.sensor_depth)));
+        }
+        if wanted.mono_depth > 0.0 {
+            let loss = supervision::mono_depth(tape, depth, &wanted.known, &counts);
+            named.push(("mono_depth", tape.scale(loss, wanted.mono_depth)));
+        }
+        if wanted.mono_normal > 0.0 {
+            let normals = surface::normals(tape, gradient);
+            let normal = supervision::normal(tape, weights, normals);
+            let loss = supervision::mono_normal(tape, normal, &wanted.known, &counts);
+            named.push(("mono_normal", tape.scale(loss, wanted.mono_normal)));
+        }
+        named
     }
 
     fn interlevel_loss(

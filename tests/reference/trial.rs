@@ -4,7 +4,8 @@ use super::background::{Background, FieldConfig};
 use super::batch::{Draws, Now, Rays, Scale, Stage, Step, StepConfig, Tangent};
 use super::hash_grid::Grid;
 use super::losses::BiasReduction;
-use super::sampling::Region;
+use super::sampling::{Region, dot};
+use super::supervision::{Known, Supervision};
 use super::tape::ReluEdge;
 use std::collections::BTreeMap;
 use std::f64::consts::{PI, TAU};
@@ -214,6 +215,50 @@ pub fn step(config: StepConfig, n: usize, seed: u64) -> Step {
         stage: Stage::first(),
         relu_edge: ReluEdge::default(),
     }
+}
+
+/// `step` with every loss on masks, depths and normals, and something to know of its rays; of some of them it is not known.
+pub fn supervised(step: Step, seed: u64) -> Step {
+    let random = &mut Random(seed);
+    let mut step = step;
+    for (ray, target) in step.rays.target.iter_mut().enumerate() {
+        target[3] = f64::from(u8::from(ray % 4 != 1));
+    }
+    let known = |(ray, &direction): (usize, &[f64; 3])| {
+        let backward = normalized(direction.map(|x| -x + random.symmetric(0.3)));
+        let side = random.direction();
+        let along = dot(side, backward);
+        let right = normalized(std::array::from_fn(|i| side[i] - along * backward[i]));
+        let up = std::array::from_fn(|i| {
+            let (j, k) = ((i + 1) % 3, (i + 2) % 3);
+            backward[j] * right[k] - backward[k] * right[j]
+        });
+        Known {
+            cosine: -dot(direction, backward),
+            mono_depth: match ray % 5 {
+                3 => f64::NAN,
+                _ => random.uniform(),
+            },
+            mono_normal: match ray % 6 {
+                4 => [0.0; 3],
+                _ => random.direction(),
+            },
+            sensor_depth: match ray % 7 {
+                5 => 0.0,
+                _ => 0.5 + random.uniform(),
+            },
+            axes: [right, up, backward],
+        }
+    };
+    let rays = step.rays.directions.iter().enumerate();
+    step.rays.supervision = Supervision {
+        mask: 0.1,
+        sensor_depth: 0.2,
+        mono_depth: 0.7,
+        mono_normal: 0.05,
+        known: rays.map(known).collect(),
+    };
+    step
 }
 
 /// Stage 2 with draws for `step`.

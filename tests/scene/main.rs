@@ -7,5 +7,6 @@ mod fixtures;
 mod hostile;
 mod layouts;
 mod pictures;
+mod priors;
 mod real;
 mod regions;

@@ -5,5 +5,6 @@
 mod reference;
 
 mod golden_step;
+mod own_priors;
 mod rig;
 mod training_step;

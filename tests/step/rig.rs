@@ -5,7 +5,9 @@ use crate::reference::batch::{Density, Draws, Rays, Scale, Stage, Step, StepConf
 use crate::reference::hash_grid::{Grid, Level};
 use crate::reference::losses;
 use crate::reference::sampling::{self, Stretch};
+use crate::reference::supervision::{Known, Supervision};
 use crate::reference::tape::ReluEdge;
+use crate::reference::trial::Random;
 use neurodin::Result;
 use neurodin::config::{
     BackgroundKind, BiasReduction, Config, DensityKind, GradientKind, ScaleKind,
@@ -13,16 +15,20 @@ use neurodin::config::{
 use neurodin::gpu::{Buffer, Gpu, GpuOptions};
 use neurodin::model::HashGrid;
 use neurodin::scene::synthetic::{CENTER, RADIUS, SyntheticOptions};
-use neurodin::scene::{Region, RegionShape, Scene, SceneOptions};
+use neurodin::scene::{PriorPaths, Region, RegionShape, Scene, SceneOptions, Split};
 use neurodin::train::Trainer;
+use npyz::WriterBuilder;
 use std::collections::BTreeMap;
 use std::f64::consts::TAU;
+use std::path::Path;
 
 pub struct Rig {
     pub gpu: Gpu,
     pub config: Config,
     pub trainer: Trainer,
     pub twin: StepConfig,
+    /// Axes of the training views' cameras, by view.
+    axes: Vec<[[f64; 3]; 3]>,
     _folder: tempfile::TempDir,
 }
 
@@ -30,6 +36,21 @@ impl Rig {
     /// A trainer on a few small pictures of the built-in scene, under the validation layer, with guard words and poisoned scratch.
     /// `portable`: by the kernels that run everywhere, also where this device has faster ones.
     pub fn new(config: Config, shape: RegionShape, portable: bool) -> Result<Rig> {
+        let supervised = config.loss.is_supervised();
+        Rig::with(config, shape, portable, &mut |scene, folder| {
+            if supervised {
+                add_knowledge(scene, folder);
+            }
+        })
+    }
+
+    /// The same on a scene that `prepare` changes, with files in a folder that lasts as long as this.
+    pub fn with(
+        config: Config,
+        shape: RegionShape,
+        portable: bool,
+        prepare: &mut dyn FnMut(&mut Scene, &Path),
+    ) -> Result<Rig> {
         let folder = tempfile::tempdir().expect("a temporary folder");
         let root = folder.path().join("scene");
         let pictures = SyntheticOptions {
@@ -40,7 +61,8 @@ impl Rig {
             reference_spacing: 0.5,
         };
         pictures.write(&root, &mut |_, _, _| {})?;
-        let scene = Scene::open(&root, &SceneOptions::default())?;
+        let mut scene = Scene::open(&root, &SceneOptions::default())?;
+        prepare(&mut scene, folder.path());
         let region = Region {
             center: CENTER,
             radius: RADIUS,
@@ -56,11 +78,16 @@ impl Rig {
         })?;
         let trainer = Trainer::new(&gpu, &scene, &region, &config)?;
         let twin = twin_config(&config, &shape, trainer.model().n_views + 1);
+        let axes = scene.split(Split::Train).map(|view| {
+            let pose = scene.views[view].world_from_camera;
+            [pose.x_axis, pose.y_axis, pose.z_axis].map(|axis| axis.truncate().to_array())
+        });
         Ok(Rig {
             gpu,
             config,
             trainer,
             twin,
+            axes: axes.collect(),
             _folder: folder,
         })
     }
@@ -177,8 +204,33 @@ impl Rig {
             origins: interleaved(&self.download(&rays.origins)?),
             directions: interleaved(&self.download(&rays.directions)?),
             target: interleaved(&self.download(&rays.target)?),
-            view: view.into_iter().map(|view| view as usize).collect(),
+            view: view.iter().map(|&view| view as usize).collect(),
+            supervision: self.supervision(&view)?,
             stretches: Some((0..n).map(stretch).collect()),
+        })
+    }
+
+    /// What is wanted of rays of these views besides colour, and the priors that lie in the device's buffers.
+    fn supervision(&self, view: &[u32]) -> Result<Supervision> {
+        let loss = &self.config.loss;
+        let supervision = self.trainer.loss().supervision.as_ref();
+        let drawn = match supervision.and_then(|supervision| supervision.priors.as_ref()) {
+            Some(priors) => interleaved::<6>(&self.download(&priors.drawn)?),
+            None => Vec::new(),
+        };
+        let known = |(drawn, &view): (&[f64; 6], &u32)| Known {
+            cosine: drawn[0],
+            mono_depth: drawn[1],
+            mono_normal: [drawn[2], drawn[3], drawn[4]],
+            sensor_depth: drawn[5],
+            axes: self.axes[view as usize],
+        };
+        Ok(Supervision {
+            mask: loss.mask,
+            sensor_depth: loss.sensor_depth,
+            mono_depth: loss.mono_depth,
+            mono_normal: loss.mono_normal,
+            known: drawn.iter().zip(view).map(known).collect(),
         })
     }
 
@@ -274,6 +326,59 @@ impl Rig {
     pub fn edges(&self) -> Result<[Vec<f64>; 3]> {
         let of = |level: usize| self.download(self.trainer.renderer().sampler.edges_of(level));
         Ok([of(0)?, of(1)?, of(2)?])
+    }
+}
+
+pub fn write_npy(file: &Path, shape: &[u64], values: &[f64]) {
+    let out = std::fs::File::create(file).expect("a file");
+    let options = npyz::WriteOptions::new().default_dtype().shape(shape);
+    let mut writer = options.writer(out).begin_nd().expect("an array");
+    writer.extend(values).expect("its values");
+    writer.finish().expect("its end");
+}
+
+/// Gives every view an object mask and priors: numbers without a meaning, of other sizes than the picture, some of them unknown.
+fn add_knowledge(scene: &mut Scene, folder: &Path) {
+    let random = &mut Random(77);
+    let write = |name: &str, shape: &[u64], values: &[f64]| {
+        let file = folder.join(name);
+        write_npy(&file, shape, values);
+        Some(file)
+    };
+    for (index, view) in scene.views.iter_mut().enumerate() {
+        let (w, h) = (view.camera.width, view.camera.height);
+        let mask = image::GrayImage::from_fn(w, h, |x, y| {
+            let left_out = (x / 4 + y / 3 + index as u32).is_multiple_of(4);
+            image::Luma([if left_out { 0 } else { 255 }])
+        });
+        let file = folder.join(format!("{index}_mask.png"));
+        mask.save(&file).expect("a picture");
+        view.mask_path = Some(file);
+        let (w, h) = (u64::from(w), u64::from(h));
+        let mut some = |count: u64, unknown: f64| -> Vec<f64> {
+            let value = |random: &mut Random| match random.uniform() {
+                u if u < 0.1 => unknown,
+                _ => random.uniform(),
+            };
+            (0..count).map(|_| value(random)).collect()
+        };
+        view.priors = PriorPaths([
+            write(
+                &format!("{index}_depth.npy"),
+                &[2 * h, 2 * w],
+                &some(4 * w * h, f64::NAN),
+            ),
+            write(
+                &format!("{index}_normal.npy"),
+                &[3, h, w],
+                &some(3 * w * h, f64::NAN),
+            ),
+            write(
+                &format!("{index}_sensor.npy"),
+                &[1, h / 2, w / 2],
+                &some(w * h / 4, 0.0),
+            ),
+        ]);
     }
 }
 

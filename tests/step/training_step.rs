@@ -9,7 +9,7 @@ use crate::reference::trial::{self, Random};
 use crate::rig::{GradientRange, Rig, agreement, interleaved};
 use glam::dvec3;
 use neurodin::Result;
-use neurodin::config::{BackgroundKind, BiasReduction, Config};
+use neurodin::config::{BackgroundKind, BiasReduction, Config, MaskUse};
 use neurodin::model::Group;
 use neurodin::render::TERMS;
 use neurodin::scene::RegionShape;
@@ -149,6 +149,54 @@ fn with_the_widths_of_the_large_configurations() -> Result<()> {
     check(config, RegionShape::Sphere, 9, false)
 }
 
+/// A configuration with losses on masks, depths and normals.
+fn supervised(mut config: Config) -> Config {
+    config.scene.masks = MaskUse::Foreground;
+    config.loss.mask = 0.1;
+    config.loss.sensor_depth = 0.2;
+    config.loss.mono_depth = 0.7;
+    config.loss.mono_normal = 0.05;
+    config
+}
+
+/// In float32 the normal of taps a two-thousandth apart is known to 1e-4: these are no nearer than a five-hundredth.
+fn with_distant_taps(mut config: Config) -> Config {
+    config.hash.max = 128;
+    config
+}
+
+#[test]
+fn with_masks_depths_and_normals() -> Result<()> {
+    let config = with_distant_taps(supervised(preset("outdoor-tiny")));
+    check(config, RegionShape::Sphere, 9, false)
+}
+
+/// None of its samples lies on the surface where that is seen edge-on: f/|g·d| has a pole there, which a mask makes felt.
+#[test]
+fn second_stage_with_masks_depths_and_normals() -> Result<()> {
+    let config = supervised(second("outdoor-tiny"));
+    check(config, RegionShape::Sphere, 9, false)
+}
+
+#[test]
+fn a_room_with_masks_depths_and_normals_by_the_portable_kernels() -> Result<()> {
+    let half = dvec3(1.0, 0.8, 0.9);
+    let config = with_distant_taps(supervised(preset("indoor-tiny")));
+    check(config, RegionShape::Box { half }, 9, true)
+}
+
+/// Each alone: there is nothing of the others.
+#[test]
+fn with_a_mask_or_normals_alone() -> Result<()> {
+    let all = supervised(preset("outdoor-tiny"));
+    let mut mask = preset("outdoor-tiny");
+    (mask.scene.masks, mask.loss.mask) = (all.scene.masks, all.loss.mask);
+    check(mask, RegionShape::Sphere, 9, false)?;
+    let mut normals = with_distant_taps(preset("outdoor-tiny"));
+    normals.loss.mono_normal = all.loss.mono_normal;
+    check(normals, RegionShape::Sphere, 9, false)
+}
+
 #[test]
 fn evaluation_has_an_appearance_code_of_its_own() -> Result<()> {
     let mut config = preset("outdoor-tiny");
@@ -199,6 +247,15 @@ fn check(config: Config, shape: RegionShape, seed: u64, portable: bool) -> Resul
     named.extend(stage.bias.then_some("bias"));
     named.extend(stage.tangent.is_some().then_some("tangent"));
     named.extend((now.curvature_weight > 0.0).then_some("curvature"));
+    let weights = &rig.config.loss;
+    for (weight, name) in [
+        (weights.mask, "mask"),
+        (weights.sensor_depth, "sensor_depth"),
+        (weights.mono_depth, "mono_depth"),
+        (weights.mono_normal, "mono_normal"),
+    ] {
+        named.extend((weight > 0.0).then_some(name));
+    }
     let mut step = Step {
         config: StepConfig {
             tap_range: now.tap_range,

@@ -15,8 +15,11 @@ pub(super) struct Column {
     pub head: String,
     pub decimals: usize,
     pub more_is_better: bool,
-    of: Box<dyn Fn(&Scores) -> Option<f64>>,
+    of: Pick,
 }
+
+/// Takes a column's number from what a run came to.
+type Pick = Box<dyn Fn(&Scores) -> Option<f64>>;
 
 /// Mean and, of several runs, standard deviation.
 #[derive(Clone, Copy, Debug, PartialEq)]

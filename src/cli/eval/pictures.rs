@@ -4,7 +4,6 @@ use super::EvalArgs;
 use crate::Error;
 use crate::cli::progress::Progress;
 use crate::cli::{Context, interrupt};
-use crate::config::MaskUse;
 use crate::eval::images::{psnr, ssim};
 use crate::render::Rendered;
 use crate::scene::{Picture, Split};
@@ -48,7 +47,7 @@ pub(super) fn score(
     }
     let viewer = trained.viewer(&scene)?;
     let interrupted = interrupt::flag("stopping")?;
-    let masked = trained.config.scene.masks == MaskUse::Exclude;
+    let masked = trained.config.scene.masks.reads();
     let mut progress = Progress::new(context, "eval", 100 * held_out.len() as u64);
     let mut scores = Vec::new();
     for (nth, &view) in held_out.iter().enumerate() {

@@ -1,0 +1,35 @@
+#version 460
+#include "lib/prelude.glsl"
+#include "lib/rays.glsl"
+#include "lib/normal.glsl"
+#include "lib/supervision.glsl"
+// How far the rendered normal is from a monocular one in the camera's axes, and its gradient, one invocation per ray (Yu et al. 2022,
+// MonoSDF):  loss = sum_j |n_j - p_j| + 1 - n.p,  n the rendered sum of w n at unit length, p the prior
+layout(push_constant, scalar) uniform Args {
+    Views views;
+    U32s ray_view;    // [n]
+    F32s normals;     // [3, n] of normal_map, region frame
+    F32s priors;      // [6, n] of draw_priors
+    F32s target;      // [4, n]
+    U32s ray_outside; // [n]
+    F32sMut loss;     // [n] before scale
+    F32sMut d_image;  // [5, n] added to
+    uint n;
+    float scale; // the loss's weight / number of rays
+};
+
+void main() {
+    uint ray = item();
+    if (ray >= n) return;
+    vec3 p;
+    [[unroll]] for (uint axis = 0u; axis < 3u; axis++) p[axis] = priors.at[(PRIOR_MONO_NORMAL + axis) * n + ray];
+    float weight = p != vec3(0.0) ? ray_weight(target, ray_outside, ray, n) : 0.0;
+    float m[12] = views.at[ray_view.at[ray]].region_from_camera;
+    mat3 camera_from_region = mat3(m[0], m[1], m[2], m[4], m[5], m[6], m[8], m[9], m[10]); // by columns
+    vec3 rendered = camera_from_region * vector_at(normals, ray, n);
+    vec3 error = normal_of(rendered) - p;
+    loss.at[ray] = weight * (abs(error.x) + abs(error.y) + abs(error.z) + 1.0 - dot(normal_of(rendered), p));
+    vec3 d_rendered = scale * weight * normal_backward(rendered, sign(error) - p);
+    vec3 d_normal = transpose(camera_from_region) * d_rendered;
+    [[unroll]] for (uint axis = 0u; axis < 3u; axis++) d_image.at[(D_NORMAL + axis) * n + ray] += d_normal[axis];
+}
