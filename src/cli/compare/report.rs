@@ -46,7 +46,7 @@ pub(super) fn html(table: &Table, pictures: &[Shown], dataset: &str) -> String {
         }
         page.push_str("</tr>");
     }
-    page.push_str("</table></section><section><h2>Meshes</h2>");
+    page.push_str("</table></section><section><h2>Meshes</h2><div class=\"heroes\">");
     for shown in pictures {
         let _ = write!(
             page,
@@ -55,6 +55,6 @@ pub(super) fn html(table: &Table, pictures: &[Shown], dataset: &str) -> String {
             escape(&shown.name)
         );
     }
-    page.push_str("</section></main></body></html>\n");
+    page.push_str("</div></section></main></body></html>\n");
     page
 }
