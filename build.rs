@@ -3,7 +3,7 @@
 //! Each kernel becomes the module `kernels::<stem>` with `Args` (the push-constant block, field for field), `Shape` (the specialisation
 //! constants with their GLSL defaults) and its SPIR-V; structures behind pointers become `kernels::<Name>`. Nothing optimises the
 //! SPIR-V: that would strip the names that reflection reads, and drivers optimise anyway. A kernel that adds to floats atomically is
-//! compiled twice, once with NO_FLOAT_ATOMICS, for devices without the extension.
+//! compiled twice, and so is one that reads pairs as 64-bit integers: once with CORE_ONLY, for devices that lack either.
 
 #[allow(dead_code)]
 #[path = "src/gpu/reflect.rs"]
@@ -21,6 +21,8 @@ use std::{env, fs};
 
 /// Changes whenever this file changes what it makes of the same GLSL.
 const RECIPE: &str = "vulkan 1.2, spir-v 1.5, unoptimised, 1";
+/// Defined for the second variant of a kernel: Vulkan 1.2 without what is optional there.
+const CORE_ONLY: &str = "CORE_ONLY";
 /// Every implementation has this much, and lavapipe of 2022 no more.
 const PUSH_CONSTANT_BYTES: u32 = 128;
 
@@ -102,17 +104,13 @@ fn kernel(
     let source = Source::flatten(glsl, path)?;
     let spirv = compiled(&source, stem, "", out)?;
     let module = Module::read(&spirv).map_err(|error| format!("glsl/{stem}.comp: {error}"))?;
-    let variants: &[&str] = match module.float_atomics {
-        true => &["", "NO_FLOAT_ATOMICS"],
-        false => &[""],
-    };
-    if module.float_atomics {
-        let fallback = compiled(&source, stem, variants[1], out)?;
+    if module.beyond_core {
+        let fallback = compiled(&source, stem, CORE_ONLY, out)?;
         let fallback =
             Module::read(&fallback).map_err(|error| format!("glsl/{stem}.comp: {error}"))?;
-        if fallback.float_atomics {
+        if fallback.beyond_core {
             return Err(format!(
-                "glsl/{stem}.comp: adds to floats atomically without add() of lib/prelude.glsl"
+                "glsl/{stem}.comp: needs float atomics or 64-bit integers, though {CORE_ONLY} is defined (lib/prelude.glsl)"
             ));
         }
     }
@@ -363,8 +361,8 @@ fn rust_module(stem: &str, source: &Source, module: &Module) -> Result<String, S
             spirv_file(stem, define)
         )
     };
-    let fallback = match module.float_atomics {
-        true => format!("Some({})", embed("NO_FLOAT_ATOMICS")),
+    let fallback = match module.beyond_core {
+        true => format!("Some({})", embed(CORE_ONLY)),
         false => "None".into(),
     };
     let mut pointers = String::new();
@@ -380,10 +378,9 @@ fn rust_module(stem: &str, source: &Source, module: &Module) -> Result<String, S
     let _ = writeln!(
         w,
         "pub(super) static MODULE: crate::gpu::KernelModule = crate::gpu::KernelModule {{ name: {stem:?}, local_size: {:?}, spirv: {}, \
-         spirv_without_float_atomics: {fallback}, int64: {}, pointers: &[{pointers}], indirect_reads: {}, indirect_writes: {} }};\n}}",
+         spirv_of_core: {fallback}, pointers: &[{pointers}], indirect_reads: {}, indirect_writes: {} }};\n}}",
         module.local_size,
         embed(""),
-        module.int64,
         module.indirect_reads,
         module.indirect_writes
     );

@@ -37,14 +37,14 @@ void main() {
         for (uint l = first_level; l < end_level; ++l) {
             Level level = levels.at[l];
             Cell cell = cell_of(level, x);
-            float feature[FEATURES];
-            [[unroll]] for (uint f = 0u; f < FEATURES; ++f) feature[f] = 0.0;
+            vec2 features[PAIRS];
+            [[unroll]] for (uint k = 0u; k < PAIRS; ++k) features[k] = vec2(0.0);
             [[unroll]] for (uint corner = 0u; corner < 8u; ++corner) {
-                uint entry = corner_entry(level, cell, corner) * FEATURES;
+                uint entry = corner_entry(level, cell, corner);
                 float weight = corner_weight(cell, corner);
-                [[unroll]] for (uint f = 0u; f < FEATURES; ++f) feature[f] = fma(weight, table.at[entry + f], feature[f]);
+                [[unroll]] for (uint k = 0u; k < PAIRS; ++k) features[k] = fma(vec2(weight), load_features(table, entry, k), features[k]);
             }
-            [[unroll]] for (uint f = 0u; f < FEATURES; ++f) inputs.at[(COORDINATES + l * FEATURES + f) * n + point] = feature[f];
+            [[unroll]] for (uint f = 0u; f < FEATURES; ++f) inputs.at[(COORDINATES + l * FEATURES + f) * n + point] = features[f / 2u][f % 2u];
         }
     }
     if (PART == 1u) return;

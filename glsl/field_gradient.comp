@@ -47,12 +47,13 @@ void main() {
     for (uint l = 0u; l < LEVELS; ++l) {
         Level level = levels.at[l];
         Cell cell = cell_of(level, x);
-        float slope[FEATURES];
-        [[unroll]] for (uint f = 0u; f < FEATURES; ++f) slope[f] = slopes.at[(COORDINATES + l * FEATURES + f) * n + point];
+        vec2 slope[PAIRS];
+        slope[PAIRS - 1u] = vec2(0.0);
+        [[unroll]] for (uint f = 0u; f < FEATURES; ++f) slope[f / 2u][f % 2u] = slopes.at[(COORDINATES + l * FEATURES + f) * n + point];
         [[unroll]] for (uint corner = 0u; corner < 8u; ++corner) {
-            uint entry = corner_entry(level, cell, corner) * FEATURES;
+            uint entry = corner_entry(level, cell, corner);
             float value = 0.0;
-            [[unroll]] for (uint f = 0u; f < FEATURES; ++f) value = fma(slope[f], table.at[entry + f], value);
+            [[unroll]] for (uint k = 0u; k < PAIRS; ++k) value += dot(slope[k], load_features(table, entry, k));
             g += value * corner_slope(level, cell, corner);
         }
     }

@@ -29,19 +29,20 @@ void main() {
     for (uint l = 0u; l < LEVELS; ++l) {
         Level level = levels.at[l];
         Cell cell = cell_of(level, x);
-        float d_e[FEATURES], slope[FEATURES];
+        vec2 d_e[PAIRS], slope[PAIRS];
+        d_e[PAIRS - 1u] = slope[PAIRS - 1u] = vec2(0.0);
         [[unroll]] for (uint f = 0u; f < FEATURES; ++f) {
             uint row = (COORDINATES + l * FEATURES + f) * n + point;
-            d_e[f] = d_inputs.at[row];
-            slope[f] = slopes.at[row];
+            d_e[f / 2u][f % 2u] = d_inputs.at[row];
+            slope[f / 2u][f % 2u] = slopes.at[row];
         }
         [[unroll]] for (uint corner = 0u; corner < 8u; ++corner) {
-            uint entry = corner_entry(level, cell, corner) * FEATURES;
+            uint entry = corner_entry(level, cell, corner);
             float first = 0.0, second = 0.0;
-            [[unroll]] for (uint f = 0u; f < FEATURES; ++f) {
-                float value = table.at[entry + f];
-                first = fma(d_e[f], value, first);
-                second = fma(slope[f], value, second);
+            [[unroll]] for (uint k = 0u; k < PAIRS; ++k) {
+                vec2 stored = load_features(table, entry, k);
+                first += dot(d_e[k], stored);
+                second += dot(slope[k], stored);
             }
             d_x += first * corner_slope(level, cell, corner) + second * corner_curvature(level, cell, corner, v);
         }

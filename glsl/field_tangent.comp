@@ -25,12 +25,12 @@ void main() {
     }
     Level level = levels.at[l];
     Cell cell = cell_of(level, x);
-    float tangent[FEATURES];
-    [[unroll]] for (uint f = 0u; f < FEATURES; ++f) tangent[f] = 0.0;
+    vec2 tangent[PAIRS];
+    [[unroll]] for (uint k = 0u; k < PAIRS; ++k) tangent[k] = vec2(0.0);
     [[unroll]] for (uint corner = 0u; corner < 8u; ++corner) {
-        uint entry = corner_entry(level, cell, corner) * FEATURES;
+        uint entry = corner_entry(level, cell, corner);
         float along = dot(corner_slope(level, cell, corner), v);
-        [[unroll]] for (uint f = 0u; f < FEATURES; ++f) tangent[f] = fma(along, table.at[entry + f], tangent[f]);
+        [[unroll]] for (uint k = 0u; k < PAIRS; ++k) tangent[k] = fma(vec2(along), load_features(table, entry, k), tangent[k]);
     }
-    [[unroll]] for (uint f = 0u; f < FEATURES; ++f) tangents.at[(COORDINATES + l * FEATURES + f) * n + point] = tangent[f];
+    [[unroll]] for (uint f = 0u; f < FEATURES; ++f) tangents.at[(COORDINATES + l * FEATURES + f) * n + point] = tangent[f / 2u][f % 2u];
 }

@@ -5,18 +5,22 @@
 #include "lib/prelude.glsl"
 #include "lib/hash_grid.glsl"
 #include "lib/scatter.glsl"
+#include "lib/entry.glsl"
 
 const uint POINTS = 4u;  // per turn of the loop
 
 void scatter(Level level, uint l, uint point) {
     if (!visit(level, l, point)) return;
     uint corner = gl_LocalInvocationID.x;
-    uint entry = corner_entry(level, cell, corner) * FEATURES;
+    uint entry = corner_entry(level, cell, corner);
     vec2 factors = corner_factors(level, corner);
     if (corners_may_meet(level, cell)) {
-        [[unroll]] for (uint f = 0u; f < FEATURES; ++f) add(d_table, entry + f, added(factors, f));
+        [[unroll]] for (uint f = 0u; f < FEATURES; ++f) add(d_table, entry * FEATURES + f, added(factors, f));
     } else {
-        [[unroll]] for (uint f = 0u; f < FEATURES; ++f) d_table.at[entry + f] += added(factors, f);
+        [[unroll]] for (uint k = 0u; k < PAIRS; ++k) {
+            vec2 more = vec2(added(factors, 2u * k), FEATURES == 1u ? 0.0 : added(factors, 2u * k + 1u));
+            store_features(d_table, entry, k, load_features(reading(d_table), entry, k) + more);
+        }
     }
     // The next point's corners may be this one's, in other lanes.
     subgroupMemoryBarrierBuffer();

@@ -7,6 +7,7 @@
 
 layout(constant_id = 0) const uint LEVELS = 12;
 layout(constant_id = 1) const uint FEATURES = 2;
+#include "lib/entry.glsl"
 
 layout(push_constant, scalar) uniform Args {
     Levels levels;
@@ -45,9 +46,12 @@ void main() {
         uint stamp = stamp_in(stamps.at[slot >> 2u], slot);
         if (stamp == now) continue;
         Lag lag = lags.at[stamp];
-        [[unroll]] for (uint f = 0u; f < FEATURES; ++f) {
-            uint i = entry * FEATURES + f;
-            table.at[i] = caught_up(Moving(table.at[i], first_moment.at[i], second_moment.at[i]), lag, lags, stamp, now, rates);
+        [[unroll]] for (uint k = 0u; k < PAIRS; ++k) {
+            vec2 p = load_features(reading(table), entry, k);
+            vec2 m = load_features(first_moment, entry, k);
+            vec2 v = load_features(second_moment, entry, k);
+            [[unroll]] for (uint f = 0u; f < 2u; ++f) p[f] = caught_up(Moving(p[f], m[f], v[f]), lag, lags, stamp, now, rates);
+            store_features(table, entry, k, p);
         }
     }
     touched = subgroupAdd(touched);

@@ -8,6 +8,7 @@
 
 layout(constant_id = 0) const uint FEATURES = 2;
 layout(constant_id = 1) const uint STRIP = 16;  // words of 32 marks: long strips have equally much to do, short ones are many
+#include "lib/entry.glsl"
 
 layout(push_constant, scalar) uniform Args {
     Levels levels;
@@ -42,18 +43,25 @@ void update_stale(uint entry, uint slot, bool marked) {
     uint stamp = stamp_in(stamps.at[slot >> 2u], slot);
     Lag lag = NO_LAG;
     if (stamp != now) lag = lags.at[stamp];
-    [[unroll]] for (uint f = 0u; f < FEATURES; ++f) {
-        uint i = entry * FEATURES + f;
-        Moving x = Moving(table.at[i], first_moment.at[i], second_moment.at[i]);
-        if (!marked) x.p = caught_up(x, lag, lags, stamp, now, rates);
-        x.m *= lag.first;
-        x.v *= lag.second;
-        float g = grads.at[i];
-        if (marked) grads.at[i] = 0.0;
-        if (!bad) x = adam_step(x, g, rates);
-        table.at[i] = x.p;
-        first_moment.at[i] = x.m;
-        second_moment.at[i] = x.v;
+    [[unroll]] for (uint k = 0u; k < PAIRS; ++k) {
+        vec2 p = load_features(reading(table), entry, k);
+        vec2 g = load_features(reading(grads), entry, k);
+        vec2 m = load_features(reading(first_moment), entry, k);
+        vec2 v = load_features(reading(second_moment), entry, k);
+        [[unroll]] for (uint f = 0u; f < 2u; ++f) {
+            Moving x = Moving(p[f], m[f], v[f]);
+            if (!marked) x.p = caught_up(x, lag, lags, stamp, now, rates);
+            x.m *= lag.first;
+            x.v *= lag.second;
+            if (!bad) x = adam_step(x, g[f], rates);
+            p[f] = x.p;
+            m[f] = x.m;
+            v[f] = x.v;
+        }
+        if (marked) store_features(grads, entry, k, vec2(0.0));
+        store_features(table, entry, k, p);
+        store_features(first_moment, entry, k, m);
+        store_features(second_moment, entry, k, v);
     }
     stamps.at[slot >> 2u] ^= (stamp ^ next) << (8u * (slot & 3u));
 }

@@ -25,7 +25,7 @@ layout(push_constant, scalar) uniform Args {
 };
 
 const uint AT_ONCE = 4u;
-const uint TURNS = 128u;  // parameters of an invocation: few workgroups where there is nothing to do
+const uint TURNS = 64u;  // pairs of parameters of an invocation: few workgroups where there is nothing to do
 
 void main() {
     uint l = slice();
@@ -37,23 +37,15 @@ void main() {
     Rates rates = Rates(rate, decay, correction, share1, share2, epsilon);
     for (uint turn = 0u; turn < TURNS; turn += AT_ONCE) {
         [[unroll]] for (uint k = 0u; k < AT_ONCE; ++k) {
-            uint j = first + (turn + k) * LOCAL_SIZE;
-            if (j < n_params) {
-                uint i = level.offset * FEATURES + j;
-                float g = grads.at[i];
-                grads.at[i] = 0.0;
-                Moving x = Moving(table.at[i], first_moment.at[i], second_moment.at[i]);
-                if (!bad) x = adam_step(x, g, rates);
-                table.at[i] = x.p;
-                first_moment.at[i] = x.m;
-                second_moment.at[i] = x.v;
-            }
+            uint j = 2u * (first + (turn + k) * LOCAL_SIZE);
+            // Levels have an even number of entries.
+            if (j < n_params) update_pair(table, grads, first_moment, second_moment, level.offset * FEATURES + j, bad, rates);
         }
     }
     // The next step marks this level again, and needs its stamps.
     if (whole == 1u) {
         uint next = bad ? clock.at[0] : (clock.at[0] + 1u) % READINGS;
-        uint n_words = (level.entries + 3u) / 4u, per_group = LOCAL_SIZE * TURNS / FEATURES / 4u;
+        uint n_words = (level.entries + 3u) / 4u, per_group = 2u * LOCAL_SIZE * TURNS / FEATURES / 4u;
         for (uint j = gl_LocalInvocationID.x; j < per_group; j += LOCAL_SIZE) {
             uint word = group() * per_group + j;
             if (word < n_words) stamps.at[first_slot(level, l) / 4u + word] = next * 0x01010101u;

@@ -22,3 +22,22 @@ Moving adam_step(Moving x, float g, Rates r) {
     float v = fma(r.share2, g * g - x.v, x.v);
     return Moving(x.p - fma(r.decay, x.p, r.rate * m / (sqrt(v) / r.correction + r.epsilon)), m, v);
 }
+
+// The step of two parameters from an even index i on; their gradients are consumed. A bad step changes nothing else.
+void update_pair(F32sMut params, F32sMut grads, F32sMut first_moment, F32sMut second_moment, uint i, bool bad, Rates rates) {
+    vec2 g = pair_at(reading(grads), i);
+    set_pair(grads, i, vec2(0.0));
+    if (bad) return;
+    vec2 p = pair_at(reading(params), i);
+    vec2 m = pair_at(reading(first_moment), i);
+    vec2 v = pair_at(reading(second_moment), i);
+    [[unroll]] for (uint k = 0u; k < 2u; ++k) {
+        Moving x = adam_step(Moving(p[k], m[k], v[k]), g[k], rates);
+        p[k] = x.p;
+        m[k] = x.m;
+        v[k] = x.v;
+    }
+    set_pair(params, i, p);
+    set_pair(first_moment, i, m);
+    set_pair(second_moment, i, v);
+}

@@ -8,6 +8,8 @@ layout(constant_id = 4) const uint SOFTPLUS = 1;     // hidden activation: 1 sof
 layout(constant_id = 5) const uint BIAS = 1;
 layout(constant_id = 6) const uint TILE = 8;         // hidden neurons per pass over the inputs; divides HIDDEN
 
+#include "lib/entry.glsl"
+
 const uint INPUTS = COORDINATES + LEVELS * FEATURES;
 
 // log(1 + e^{100u})/100 without overflow; equal to the published form, which turns linear above 100u = 20, to 2e-11.

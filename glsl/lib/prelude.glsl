@@ -26,6 +26,26 @@ layout(buffer_reference, scalar, buffer_reference_align = 4) buffer F32sMut { fl
 layout(buffer_reference, scalar, buffer_reference_align = 4) readonly buffer U32s { uint at[]; };
 layout(buffer_reference, scalar, buffer_reference_align = 4) buffer U32sMut { uint at[]; };
 
+// What is only read, of what may be written.
+F32s reading(F32sMut p) { return F32s(uvec2(p)); }
+
+// Two neighbours from an even index on, in one access: software devices make one of each component of a vector.
+#ifdef CORE_ONLY
+vec2 pair_at(F32s p, uint i) { return vec2(p.at[i], p.at[i + 1u]); }
+
+void set_pair(F32sMut p, uint i, vec2 v) {
+    p.at[i] = v.x;
+    p.at[i + 1u] = v.y;
+}
+#else
+layout(buffer_reference, scalar, buffer_reference_align = 8) readonly buffer U64s { uint64_t at[]; };
+layout(buffer_reference, scalar, buffer_reference_align = 8) buffer U64sMut { uint64_t at[]; };
+
+vec2 pair_at(F32s p, uint i) { return uintBitsToFloat(unpackUint2x32(U64s(uvec2(p)).at[i >> 1u])); }
+
+void set_pair(F32sMut p, uint i, vec2 v) { U64sMut(uvec2(p)).at[i >> 1u] = packUint2x32(floatBitsToUint(v)); }
+#endif
+
 // Index of this invocation among the launch's items, in rows of 256 workgroups: one dimension of a grid ends at 65535 workgroups.
 // The last row is ragged, so a kernel leaves its body where item() >= n.
 uint item() { return (gl_WorkGroupID.y * 256u + gl_WorkGroupID.x) * gl_WorkGroupSize.x + gl_LocalInvocationID.x; }
@@ -38,7 +58,7 @@ uint slice() { return gl_WorkGroupID.z; }
 
 // Adds to a float that other invocations add to as well. Without the extension: compare and swap until nobody came between.
 void add(F32sMut p, uint i, float v) {
-#ifdef NO_FLOAT_ATOMICS
+#ifdef CORE_ONLY
     U32sMut bits = U32sMut(uvec2(p));
     uint seen = bits.at[i];
     uint expected;

@@ -85,6 +85,7 @@ impl Gpu {
         let (physical, mut info) = devices.into_iter().nth(chosen).expect("chosen from these");
         if options.portable {
             info.float_atomics = false;
+            info.int64 = false;
             info.few_cores = false;
             info.full_subgroups = None;
         }

@@ -18,10 +18,8 @@ pub struct KernelModule {
     pub local_size: [u32; 3],
     /// SPIR-V 1.5, little-endian words.
     pub spirv: &'static [u8],
-    /// The variant for devices without float atomics, where the kernel uses them.
-    pub spirv_without_float_atomics: Option<&'static [u8]>,
-    /// Whether it needs 64-bit integers.
-    pub int64: bool,
+    /// The variant for devices without float atomics or without 64-bit integers, where the kernel uses them.
+    pub spirv_of_core: Option<&'static [u8]>,
     /// The pointers in the push-constant block.
     pub pointers: &'static [PointerArg],
     /// Whether it reads, or writes, through pointers found elsewhere than in the block.
@@ -176,8 +174,8 @@ impl Pipelines {
         module: &'static KernelModule,
         constants: &[(u32, u32)],
     ) -> Result<vk::Pipeline> {
-        let spirv = match module.spirv_without_float_atomics {
-            Some(fallback) if !info.float_atomics => fallback,
+        let spirv = match module.spirv_of_core {
+            Some(fallback) if !(info.float_atomics && info.int64) => fallback,
             _ => module.spirv,
         };
         let words: Vec<u32> = bytemuck::pod_collect_to_vec(spirv);
@@ -283,14 +281,6 @@ impl Gpu {
     pub fn kernel<S: KernelShape>(&self, shape: S) -> Result<Kernel<S::Args>> {
         let module = S::module();
         let info = &self.inner.info;
-        if module.int64 && !info.int64 {
-            return Err(Error::NoDevice {
-                what: format!(
-                    "kernel {} needs 64-bit integers, {} has none",
-                    module.name, info.name
-                ),
-            });
-        }
         let pipelines = &self.inner.pipelines;
         let key = (module.name, shape.constants());
         let mut built = pipelines.built.lock().expect("no panic under the lock");

@@ -65,16 +65,17 @@ pub struct Module {
     pub structs: BTreeMap<String, Struct>,
     /// Specialisation constants, by id.
     pub constants: Vec<Constant>,
-    /// Adds to floats in memory atomically (capability AtomicFloat32AddEXT).
-    pub float_atomics: bool,
-    /// Uses 64-bit integers.
-    pub int64: bool,
+    /// Adds to floats in memory atomically (capability AtomicFloat32AddEXT), or uses 64-bit integers: Vulkan 1.2 has them on some devices.
+    pub beyond_core: bool,
     /// Reads through pointers that are not members of the block: found in memory, or computed.
     pub indirect_reads: bool,
     /// Writes through such pointers.
     pub indirect_writes: bool,
 }
 
+/// Functions of glsl/lib/prelude.glsl, as glslang names them, that look at an argument of theirs in another way: the pointers that they make
+/// lead nowhere new.
+const VIEWS: [&str; 4] = ["reading(", "pair_at(", "set_pair(", "add("];
 const CAPABILITY_INT64: u32 = 11;
 const CAPABILITY_ATOMIC_FLOAT32_ADD: u32 = 6033;
 const DECORATION_SPEC_ID: u32 = 1;
@@ -125,6 +126,7 @@ impl Module {
         let mut push_block = None;
         let mut capabilities = HashSet::new();
         let mut made_pointers = HashSet::new();
+        let mut in_view = false;
         let mut spec_composites = HashSet::new();
         let mut at = 5;
         while at < spirv.len() {
@@ -183,7 +185,11 @@ impl Module {
                 72 if w[3] == DECORATION_NON_WRITABLE => {
                     words.non_writable.insert((w[1], w[2]));
                 }
-                120 | 124 => drop(made_pointers.insert(w[1])),
+                54 => {
+                    let name = words.names.get(&w[2]).map_or("", String::as_str);
+                    in_view = VIEWS.iter().any(|view| name.starts_with(view));
+                }
+                120 | 124 if !in_view => drop(made_pointers.insert(w[1])),
                 _ => {}
             }
             at += count;
@@ -235,8 +241,8 @@ impl Module {
             args,
             structs,
             constants,
-            float_atomics: capabilities.contains(&CAPABILITY_ATOMIC_FLOAT32_ADD),
-            int64: capabilities.contains(&CAPABILITY_INT64),
+            beyond_core: capabilities.contains(&CAPABILITY_ATOMIC_FLOAT32_ADD)
+                || capabilities.contains(&CAPABILITY_INT64),
             indirect_reads: false,
             indirect_writes: false,
         };
@@ -478,7 +484,7 @@ mod tests {
         assert_eq!(module.args, args);
         assert_eq!(module.local_size, [64, 1, 1]);
         assert_eq!(module.constants, []);
-        assert!(!module.indirect_reads && !module.float_atomics && !module.int64);
+        assert!(!module.indirect_reads && !module.beyond_core);
     }
 
     #[test]
