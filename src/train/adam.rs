@@ -65,7 +65,11 @@ impl Adam {
                 share2: (1.0 - c.beta2) as f32,
                 epsilon: c.epsilon as f32,
             };
-            rec.run(&self.kernel, Work::items(n.div_ceil(2)).flops(30.0).bytes(64.0), args);
+            rec.run(
+                &self.kernel,
+                Work::items(n.div_ceil(2)).flops(30.0).bytes(64.0),
+                args,
+            );
         }
     }
 }
