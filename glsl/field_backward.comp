@@ -8,7 +8,8 @@
 #include "lib/prelude.glsl"
 #include "lib/field.glsl"
 
-layout(constant_id = 7) const uint SECOND_ORDER = 0;
+layout(constant_id = 7) const uint HEADS = 1;  // as in field_forward
+layout(constant_id = 8) const uint SECOND_ORDER = 0;
 
 layout(push_constant, scalar) uniform Args {
     F32s hidden_weight;      // [HIDDEN, INPUTS]
@@ -25,6 +26,8 @@ layout(push_constant, scalar) uniform Args {
     F32sMut d_head_bias;     // [1] accumulated
     uint n;
     uint n_hidden;
+    uint begin;              // the points of this launch
+    uint end;
 };
 
 const uint FIRST_INPUT = SECOND_ORDER != 0u ? 0u : COORDINATES;
@@ -32,11 +35,11 @@ const uint OUT_INPUTS = INPUTS - FIRST_INPUT;
 const uint TANGENTS = SECOND_ORDER != 0u ? INPUTS : 1u;
 
 void main() {
-    uint point = item();
+    uint point = begin + item();
     // Invocations past the end stay for the subgroup's sums and add nothing. (Summing up in shared memory first would halve the speed on
     // software devices, where a barrier costs more than an atomic add.)
-    bool inside = point < n;
-    uint p = inside ? point : 0u;
+    bool inside = point < end;
+    uint p = inside ? point : begin;
     float z[INPUTS];
     [[unroll]] for (uint i = 0u; i < INPUTS; ++i) z[i] = inputs.at[i * n + p];
     float z_dot[TANGENTS];
@@ -44,7 +47,7 @@ void main() {
         [[unroll]] for (uint i = 0u; i < TANGENTS; ++i) z_dot[i] = inside ? tangents.at[i * n + p] : 0.0;
     }
     float d_out = inside ? d_first.at[p] : 0.0;
-    bool has_heads = inside && point < n_hidden;
+    bool has_heads = HEADS != 0u && inside && point < n_hidden;
     float d_z[OUT_INPUTS];
     [[unroll]] for (uint i = 0u; i < OUT_INPUTS; ++i) d_z[i] = 0.0;
 

@@ -9,6 +9,10 @@ use crate::kernels::{
     Level, field_backward, field_forward, field_gradient, field_point_backward, field_tangent,
     hash_grid_backward, hash_grid_backward_owned,
 };
+use std::ops::Range;
+
+/// Weights up to which a network's forward pass is straight-line code: beyond, drivers take long over it and make it slower.
+const MOST_WRITTEN_OUT: u32 = 64 * 64;
 
 /// What fixes a field's kernels.
 #[derive(Clone, Copy, Debug)]
@@ -54,8 +58,13 @@ pub struct Field {
     hidden: WeightHandle,
     heads: WeightHandle,
     levels: Buffer<Level>,
-    forward: Forward,
-    backward: Kernel<field_backward::Args>,
+    /// The network's input alone, level by level.
+    encoding: Kernel<field_forward::Args>,
+    /// The network, together with its input where that is not `apart`.
+    forward: Network<field_forward::Args>,
+    /// Whether the device's caches hold one level of the table but not all: then each is encoded before the network begins.
+    apart: bool,
+    backward: Network<field_backward::Args>,
     scatter: Scatter,
     hidden_gradient: Layer,
     by_chain_rule: Option<GradientKernels>,
@@ -63,7 +72,6 @@ pub struct Field {
 
 /// Kernels of the first output's gradient g = Jᵀ a.
 struct GradientKernels {
-    encoding: Kernel<field_forward::Args>,
     gradient: Kernel<field_gradient::Args>,
     tangent: Kernel<field_tangent::Args>,
     points: Kernel<field_point_backward::Args>,
@@ -71,11 +79,21 @@ struct GradientKernels {
     steepness: Layer,
 }
 
-/// How the device evaluates a field.
-enum Forward {
-    Fused(Kernel<field_forward::Args>),
-    /// For devices whose caches hold one level of the table but not all: level by level, then the network.
-    Parts(Kernel<field_forward::Args>, Kernel<field_forward::Args>),
+/// A kernel over a field's points, of which the leading ones have further heads.
+struct Network<A> {
+    kernel: Kernel<A>,
+    /// For devices to which each lane's question about heads is dear: the kernel for points without.
+    headless: Option<Kernel<A>>,
+}
+
+impl<A> Network<A> {
+    /// What to launch for `n` points, `n_hidden` of them with heads.
+    fn launches(&self, n: u32, n_hidden: u32) -> Vec<(&Kernel<A>, Range<u32>)> {
+        match &self.headless {
+            None => vec![(&self.kernel, 0..n)],
+            Some(headless) => vec![(&self.kernel, 0..n_hidden), (headless, n_hidden..n)],
+        }
+    }
 }
 
 /// How the device adds up the table's gradient.
@@ -193,6 +211,11 @@ impl Field {
             softplus,
             bias,
             tile,
+            heads: 1,
+            block: match shape.hidden * shape.inputs() > MOST_WRITTEN_OUT {
+                true => tile,
+                false => shape.hidden,
+            },
             part: 0,
         };
         let backward = field_backward::Shape {
@@ -203,6 +226,7 @@ impl Field {
             softplus,
             bias,
             tile,
+            heads: 1,
             second_order,
         };
         let hidden_layer = || LayerShape {
@@ -214,13 +238,21 @@ impl Field {
             inputs_are_relu: false,
         };
         let few_cores = gpu.info().few_cores;
-        let forward_part = |part, name: &str| -> Result<_> {
-            let shape = field_forward::Shape { part, ..forward };
+        let forward_part = |part, heads, name: &str| -> Result<_> {
+            let shape = field_forward::Shape {
+                part,
+                heads,
+                ..forward
+            };
             Ok(gpu.kernel(shape)?.labelled(name))
         };
+        let backward = |heads| -> Result<_> {
+            let shape = field_backward::Shape { heads, ..backward };
+            Ok(gpu.kernel(shape)?.labelled(label))
+        };
+        let network = format!("{label} network");
         let by_chain_rule = match shape.gradient {
             true => Some(GradientKernels {
-                encoding: forward_part(1, &format!("{label} encoding"))?,
                 gradient: gpu
                     .kernel(field_gradient::Shape {
                         levels: grid_levels,
@@ -262,14 +294,25 @@ impl Field {
             hidden,
             heads,
             levels,
+            encoding: forward_part(1, 0, &format!("{label} encoding"))?,
             forward: match few_cores {
-                true => Forward::Parts(
-                    forward_part(1, &format!("{label} encoding"))?,
-                    forward_part(2, &format!("{label} network"))?,
-                ),
-                false => Forward::Fused(forward_part(0, label)?),
+                true => Network {
+                    kernel: forward_part(2, 1, &network)?,
+                    headless: Some(forward_part(2, 0, &network)?),
+                },
+                false => Network {
+                    kernel: forward_part(0, 1, label)?,
+                    headless: None,
+                },
             },
-            backward: gpu.kernel(backward)?.labelled(label),
+            apart: few_cores,
+            backward: Network {
+                kernel: backward(1)?,
+                headless: match few_cores {
+                    true => Some(backward(0)?),
+                    false => None,
+                },
+            },
             scatter: match few_cores {
                 true => {
                     let shape = hash_grid_backward_owned::Shape {
@@ -320,23 +363,22 @@ impl Field {
         buffers: &FieldBuffers,
         first: PtrMut<f32>,
     ) {
-        let args = self.forward_args(params, points, buffers, first);
-        let work = Work::items(u64::from(buffers.n));
-        let (interpolation, network) = (self.interpolation_flops(), self.hidden_flops());
-        let (gather, rows) = (self.gather_bytes(), 4.0 * f64::from(self.shape.inputs()));
-        match &self.forward {
-            Forward::Fused(kernel) => {
-                let work = work.flops(interpolation + network);
-                rec.run(kernel, work.bytes(gather + 2.0 * rows), args);
-            }
-            Forward::Parts(encoding, head) => {
-                rec.run(encoding, self.encoding_work(buffers.n), args);
-                rec.run(head, work.flops(network).bytes(rows), args);
-            }
+        let mut flops = self.hidden_flops();
+        let mut bytes = 4.0 * f64::from(self.shape.inputs());
+        if self.apart {
+            self.encode(rec, params, points, buffers);
+        } else {
+            flops += self.interpolation_flops();
+            bytes = 2.0 * bytes + self.gather_bytes();
+        }
+        for (kernel, launch) in self.forward.launches(buffers.n, buffers.n_hidden) {
+            let work = Work::items(launch.len() as u64).flops(flops).bytes(bytes);
+            let args = self.forward_args(params, points, buffers, first, launch);
+            rec.run(kernel, work, args);
         }
     }
 
-    /// Only the network's input at `points [3, n]`: enough for [`Field::gradient`], where nobody asks for the output.
+    /// Only the network's input at `points [3, n]`: enough for [`Field::gradient`] where nobody asks for the output.
     pub fn encode(
         &self,
         rec: &mut Recorder,
@@ -345,22 +387,14 @@ impl Field {
         buffers: &FieldBuffers,
     ) {
         let unused = buffers.inputs.ptr_mut();
-        let args = self.forward_args(params, points, buffers, unused);
-        rec.run(
-            &self.kernels().encoding,
-            self.encoding_work(buffers.n),
-            args,
-        );
-    }
-
-    /// Encoding `n` points, a level in a slice.
-    fn encoding_work(&self, n: u32) -> Work {
+        let args = self.forward_args(params, points, buffers, unused, 0..buffers.n);
         let levels = f64::from(self.shape.grid.levels);
         let rows = 4.0 * f64::from(self.shape.inputs());
-        Work::items(u64::from(n))
+        let work = Work::items(u64::from(buffers.n))
             .slices(self.shape.grid.levels)
             .flops(self.interpolation_flops() / levels)
-            .bytes((self.gather_bytes() + rows) / levels)
+            .bytes((self.gather_bytes() + rows) / levels);
+        rec.run(&self.encoding, work, args);
     }
 
     fn forward_args(
@@ -369,6 +403,7 @@ impl Field {
         points: Ptr<f32>,
         buffers: &FieldBuffers,
         first: PtrMut<f32>,
+        launch: Range<u32>,
     ) -> field_forward::Args {
         field_forward::Args {
             levels: self.levels.ptr(),
@@ -383,6 +418,8 @@ impl Field {
             first,
             n: buffers.n,
             n_hidden: buffers.n_hidden,
+            begin: launch.start,
+            end: launch.end,
         }
     }
 
@@ -447,7 +484,7 @@ impl Field {
                 args,
             );
         }
-        let args = field_backward::Args {
+        let mut args = field_backward::Args {
             hidden_weight: params.weight(self.hidden, 0),
             hidden_bias: params.bias(self.hidden, 0),
             head_weight: params.weight(self.heads, 0),
@@ -462,14 +499,17 @@ impl Field {
             d_head_bias: params.d_bias(self.heads, 0),
             n,
             n_hidden: buffers.n_hidden,
+            begin: 0,
+            end: n,
         };
         let products = if slope.is_some() { 3.0 } else { 2.0 };
-        let work = items.flops(products * self.hidden_flops());
-        rec.run(
-            &self.backward,
-            work.bytes(products * rows + 4.0 * f64::from(self.shape.hidden)),
-            args,
-        );
+        for (kernel, launch) in self.backward.launches(n, buffers.n_hidden) {
+            let work = Work::items(launch.len() as u64)
+                .flops(products * self.hidden_flops())
+                .bytes(products * rows + 4.0 * f64::from(self.shape.hidden));
+            (args.begin, args.end) = (launch.start, launch.end);
+            rec.run(kernel, work, args);
+        }
         let d_preactivation = scratch.d_preactivation.ptr();
         self.hidden_gradient
             .gradient(rec, params, buffers.inputs.ptr(), n, d_preactivation, n);
