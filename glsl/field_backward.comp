@@ -16,18 +16,20 @@ layout(push_constant, scalar) uniform Args {
     F32s hidden_bias;        // [HIDDEN]
     F32s head_weight;        // [HIDDEN]
     F32s inputs;             // [INPUTS, n]
-    F32s tangents;           // [INPUTS, n] ȧ, with SECOND_ORDER
+    F32s tangents;           // [INPUTS, m] ȧ, with SECOND_ORDER
     F32s d_first;            // [n]
     F32s d_hidden;           // [HIDDEN, n_hidden] from the other heads
-    F32sMut d_preactivation; // [HIDDEN, n] d_u
-    F32sMut steepness;       // [HIDDEN, n] s, with SECOND_ORDER
-    F32sMut d_inputs;        // [INPUTS, n] d_z; without SECOND_ORDER [LEVELS * FEATURES, n] d_e
+    F32sMut d_preactivation; // [HIDDEN, m] d_u
+    F32sMut steepness;       // [HIDDEN, m] s, with SECOND_ORDER
+    F32sMut d_inputs;        // [INPUTS, m] d_z; without SECOND_ORDER [LEVELS * FEATURES, m] d_e
     F32sMut d_head_weight;   // [HIDDEN] accumulated
     F32sMut d_head_bias;     // [1] accumulated
     uint n;
     uint n_hidden;
     uint begin;              // the points of this launch
     uint end;
+    uint first;              // of the m points for which there is scratch memory
+    uint m;
 };
 
 const uint FIRST_INPUT = SECOND_ORDER != 0u ? 0u : COORDINATES;
@@ -40,11 +42,12 @@ void main() {
     // software devices, where a barrier costs more than an atomic add.)
     bool inside = point < end;
     uint p = inside ? point : begin;
+    uint q = p - first;
     float z[INPUTS];
     [[unroll]] for (uint i = 0u; i < INPUTS; ++i) z[i] = inputs.at[i * n + p];
     float z_dot[TANGENTS];
     if (SECOND_ORDER != 0u) {
-        [[unroll]] for (uint i = 0u; i < TANGENTS; ++i) z_dot[i] = inside ? tangents.at[i * n + p] : 0.0;
+        [[unroll]] for (uint i = 0u; i < TANGENTS; ++i) z_dot[i] = inside ? tangents.at[i * m + q] : 0.0;
     }
     float d_out = inside ? d_first.at[p] : 0.0;
     bool has_heads = HEADS != 0u && inside && point < n_hidden;
@@ -76,10 +79,10 @@ void main() {
             if (SECOND_ORDER != 0u) {
                 d_w2 += s_dot[t] * slope;
                 d_u += s_dot[t] * w2 * activation_curvature(slope);
-                if (inside) steepness.at[neuron * n + p] = slope * w2;
+                if (inside) steepness.at[neuron * m + q] = slope * w2;
             }
             u[t] = inside ? d_u : 0.0;
-            if (inside) d_preactivation.at[neuron * n + p] = u[t];
+            if (inside) d_preactivation.at[neuron * m + q] = u[t];
             d_w2 = subgroupAdd(d_w2);
             if (subgroupElect()) add(d_head_weight, neuron, d_w2);
         }
@@ -89,7 +92,7 @@ void main() {
         }
     }
     if (inside) {
-        [[unroll]] for (uint i = 0u; i < OUT_INPUTS; ++i) d_inputs.at[i * n + p] = d_z[i];
+        [[unroll]] for (uint i = 0u; i < OUT_INPUTS; ++i) d_inputs.at[i * m + q] = d_z[i];
     }
     if (BIAS != 0u) {
         float d_b2 = subgroupAdd(d_out);

@@ -10,21 +10,23 @@ layout(push_constant, scalar) uniform Args {
     Levels levels;
     F32s table;       // [entries, FEATURES]
     F32s points;      // [3, n]
-    F32s d_inputs;    // [INPUTS, n] d_z
+    F32s d_inputs;    // [INPUTS, end - begin] d_z
     F32s slopes;      // [INPUTS, n] a
     F32s d_gradient;  // [3, n] v
     F32sMut d_points; // [3, n]
     uint n;
+    uint begin;       // the points at hand
+    uint end;
 };
 
 void main() {
-    uint point = item();
-    if (point >= n) return;
+    uint point = begin + item(), count = end - begin;
+    if (point >= end) return;
     vec3 x = vec3(points.at[point], points.at[n + point], points.at[2u * n + point]);
     vec3 v = vec3(d_gradient.at[point], d_gradient.at[n + point], d_gradient.at[2u * n + point]);
     vec3 d_x = vec3(0.0);
     if (COORDINATES != 0u) {
-        [[unroll]] for (uint c = 0u; c < 3u; ++c) d_x[c] = d_inputs.at[c * n + point];
+        [[unroll]] for (uint c = 0u; c < 3u; ++c) d_x[c] = d_inputs.at[c * count + item()];
     }
     for (uint l = 0u; l < LEVELS; ++l) {
         Level level = levels.at[l];
@@ -32,9 +34,9 @@ void main() {
         vec2 d_e[PAIRS], slope[PAIRS];
         d_e[PAIRS - 1u] = slope[PAIRS - 1u] = vec2(0.0);
         [[unroll]] for (uint f = 0u; f < FEATURES; ++f) {
-            uint row = (COORDINATES + l * FEATURES + f) * n + point;
-            d_e[f / 2u][f % 2u] = d_inputs.at[row];
-            slope[f / 2u][f % 2u] = slopes.at[row];
+            uint row = COORDINATES + l * FEATURES + f;
+            d_e[f / 2u][f % 2u] = d_inputs.at[row * count + item()];
+            slope[f / 2u][f % 2u] = slopes.at[row * n + point];
         }
         [[unroll]] for (uint corner = 0u; corner < 8u; ++corner) {
             uint entry = corner_entry(level, cell, corner);

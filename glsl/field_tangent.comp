@@ -10,18 +10,20 @@ layout(push_constant, scalar) uniform Args {
     F32s table;       // [entries, FEATURES]
     F32s points;      // [3, n]
     F32s d_gradient;  // [3, n] v
-    F32sMut tangents; // [INPUTS, n] ȧ
+    F32sMut tangents; // [INPUTS, end - begin] ȧ
     uint n;
+    uint begin;       // the points at hand
+    uint end;
 };
 
 void main() {
-    uint point = item();
-    if (point >= n) return;
+    uint point = begin + item(), count = end - begin;
+    if (point >= end) return;
     vec3 x = vec3(points.at[point], points.at[n + point], points.at[2u * n + point]);
     vec3 v = vec3(d_gradient.at[point], d_gradient.at[n + point], d_gradient.at[2u * n + point]);
     uint l = level_of_slice(LEVELS);
     if (COORDINATES != 0u && l == 0u) {
-        [[unroll]] for (uint c = 0u; c < 3u; ++c) tangents.at[c * n + point] = v[c];
+        [[unroll]] for (uint c = 0u; c < 3u; ++c) tangents.at[c * count + item()] = v[c];
     }
     Level level = levels.at[l];
     Cell cell = cell_of(level, x);
@@ -32,5 +34,5 @@ void main() {
         float along = dot(corner_slope(level, cell, corner), v);
         [[unroll]] for (uint k = 0u; k < PAIRS; ++k) tangent[k] = fma(vec2(along), load_features(table, entry, k), tangent[k]);
     }
-    [[unroll]] for (uint f = 0u; f < FEATURES; ++f) tangents.at[(COORDINATES + l * FEATURES + f) * n + point] = tangent[f / 2u][f % 2u];
+    [[unroll]] for (uint f = 0u; f < FEATURES; ++f) tangents.at[(COORDINATES + l * FEATURES + f) * count + item()] = tangent[f / 2u][f % 2u];
 }

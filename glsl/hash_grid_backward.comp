@@ -6,8 +6,8 @@
 #include "lib/scatter.glsl"
 
 void main() {
-    uint point = item();
-    if (point >= n) return;
+    uint point = begin + item();
+    if (point >= end) return;
     uint l = slice();
     Level level = levels.at[l];
     if (!visit(level, l, point)) return;

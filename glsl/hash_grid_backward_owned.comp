@@ -29,9 +29,9 @@ void scatter(Level level, uint l, uint point) {
 void main() {
     uint l = level_of_slice(LEVELS);
     Level level = levels.at[l];
-    for (uint first = 0u; first < n; first += POINTS) {
+    for (uint first = begin; first < end; first += POINTS) {
         [[unroll]] for (uint k = 0u; k < POINTS; ++k) {
-            if (first + k < n) scatter(level, l, first + k);
+            if (first + k < end) scatter(level, l, first + k);
         }
     }
 }

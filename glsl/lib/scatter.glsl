@@ -7,11 +7,13 @@ layout(constant_id = 2) const uint SECOND_ORDER = 0;  // the table hears from th
 layout(push_constant, scalar) uniform Args {
     Levels levels;
     F32s points;      // [3, n]
-    F32s d_features;  // [LEVELS * FEATURES, n] d_e
+    F32s d_features;  // [LEVELS * FEATURES, end - begin] d_e
     F32s slopes;      // [LEVELS * FEATURES, n] a, with SECOND_ORDER
     F32s d_gradient;  // [3, n] v = ∂loss/∂g, with SECOND_ORDER
     F32sMut d_table;  // [entries, FEATURES] accumulated
     uint n;
+    uint begin;       // the points at hand
+    uint end;
 };
 
 // The point at hand, in the level at hand.
@@ -24,7 +26,7 @@ vec3 v;
 bool visit(Level level, uint l, uint point) {
     bool adds = false;
     [[unroll]] for (uint f = 0u; f < FEATURES; ++f) {
-        d_e[f] = d_features.at[(l * FEATURES + f) * n + point];
+        d_e[f] = d_features.at[(l * FEATURES + f) * (end - begin) + point - begin];
         adds = adds || d_e[f] != 0.0;
     }
     if (SECOND_ORDER != 0u) {

@@ -193,16 +193,15 @@ pub struct Radiance {
 
 struct RadianceBuffers {
     field: FieldBuffers,
-    edges: Buffer<f32>,     // [n_rays, samples + 1] distances
-    points: Buffer<f32>,    // [3, n]
-    raw: Buffer<f32>,       // [n]
-    d_raw: Buffer<f32>,     // [n]
-    shading: Buffer<f32>,   // [geometry + appearance + 16, n] glsl/lib/background.glsl
-    d_shading: Buffer<f32>, // [geometry + appearance, n]
-    hidden: [Buffer<f32>; 2],
-    d_hidden: [Buffer<f32>; 2],
-    rgb: Buffer<f32>,   // [3, n]
-    d_rgb: Buffer<f32>, // [3, n]
+    edges: Buffer<f32>,       // [n_rays, samples + 1] distances
+    points: Buffer<f32>,      // [3, n]
+    raw: Buffer<f32>,         // [n]
+    d_raw: Buffer<f32>,       // [n]
+    shading: Buffer<f32>,     // [geometry + appearance + 16, n] glsl/lib/background.glsl
+    d_shading: Buffer<f32>,   // [geometry + appearance, n]
+    hidden: [Buffer<f32>; 2], // [64, n]; in the backward pass its gradient takes its place
+    rgb: Buffer<f32>,         // [3, n]
+    d_rgb: Buffer<f32>,       // [3, n]
 }
 
 const HARMONICS: u32 = 16;
@@ -326,7 +325,6 @@ impl Radiance {
             shading: scratch("shading", self.geometry + self.appearance_dims + HARMONICS)?,
             d_shading: scratch("d_shading", self.geometry + self.appearance_dims)?,
             hidden: [scratch("hidden 0", 64)?, scratch("hidden 1", 64)?],
-            d_hidden: [scratch("d_hidden 0", 64)?, scratch("d_hidden 1", 64)?],
             rgb: scratch("rgb", 3)?,
             d_rgb: scratch("d_rgb", 3)?,
         })
@@ -432,8 +430,8 @@ impl Radiance {
         let xs = [r.shading.ptr(), r.hidden[0].ptr(), r.hidden[1].ptr()];
         let d_xs: [PtrMut<f32>; 3] = [
             r.d_shading.ptr_mut(),
-            r.d_hidden[0].ptr_mut(),
-            r.d_hidden[1].ptr_mut(),
+            r.hidden[0].ptr_mut(),
+            r.hidden[1].ptr_mut(),
         ];
         let mut d_y = r.d_rgb.ptr();
         for layer in (0..3).rev() {
@@ -459,17 +457,11 @@ impl Radiance {
                 args,
             );
         }
-        let hidden = r.field.hidden.ptr();
+        let (hidden, d_hidden) = (r.field.hidden.ptr(), r.field.hidden.ptr_mut());
         self.heads
             .gradient(rec, params, hidden, n, r.d_shading.ptr(), n);
-        self.heads.backward(
-            rec,
-            params,
-            r.d_shading.ptr(),
-            hidden,
-            r.field.d_hidden.ptr_mut(),
-            n,
-        );
+        self.heads
+            .backward(rec, params, r.d_shading.ptr(), hidden, d_hidden, n);
         self.field.backward(
             rec,
             params,
@@ -477,6 +469,7 @@ impl Radiance {
             r.d_raw.ptr(),
             &r.field,
             scratch,
+            None,
         );
     }
 }

@@ -14,6 +14,9 @@ use std::ops::Range;
 /// Weights up to which a network's forward pass is straight-line code: beyond, drivers take long over it and make it slower.
 const MOST_WRITTEN_OUT: u32 = 64 * 64;
 
+/// Points that go back through a field at once: the memory that this takes is theirs alone.
+const AT_ONCE: u32 = 1 << 16;
+
 /// What fixes a field's kernels.
 #[derive(Clone, Copy, Debug)]
 pub struct FieldShape {
@@ -87,12 +90,16 @@ struct Network<A> {
 }
 
 impl<A> Network<A> {
-    /// What to launch for `n` points, `n_hidden` of them with heads.
-    fn launches(&self, n: u32, n_hidden: u32) -> Vec<(&Kernel<A>, Range<u32>)> {
-        match &self.headless {
-            None => vec![(&self.kernel, 0..n)],
-            Some(headless) => vec![(&self.kernel, 0..n_hidden), (headless, n_hidden..n)],
-        }
+    /// What to launch for these points, of which those before `n_hidden` have heads.
+    fn launches(&self, points: Range<u32>, n_hidden: u32) -> Vec<(&Kernel<A>, Range<u32>)> {
+        let Some(headless) = &self.headless else {
+            return vec![(&self.kernel, points)];
+        };
+        let border = n_hidden.clamp(points.start, points.end);
+        vec![
+            (&self.kernel, points.start..border),
+            (headless, border..points.end),
+        ]
     }
 }
 
@@ -108,9 +115,8 @@ pub struct FieldBuffers {
     pub n: u32,
     /// Leading points whose hidden activations are kept for further heads.
     pub n_hidden: u32,
-    pub inputs: Buffer<f32>,   // [inputs, n]
-    pub hidden: Buffer<f32>,   // [hidden, n_hidden]
-    pub d_hidden: Buffer<f32>, // [hidden, n_hidden]
+    pub inputs: Buffer<f32>, // [inputs, n]
+    pub hidden: Buffer<f32>, // [hidden, n_hidden]; in the backward pass the heads put its gradient in its place
     slope: Option<Slope>,
 }
 
@@ -144,7 +150,6 @@ impl FieldBuffers {
             n_hidden,
             inputs: planes("inputs", shape.inputs())?,
             hidden: gpu.scratch(&format!("{name} hidden"), hidden_len)?,
-            d_hidden: gpu.scratch(&format!("{name} d_hidden"), hidden_len)?,
             slope,
         })
     }
@@ -158,12 +163,21 @@ impl FieldBuffers {
     }
 }
 
-/// Memory that a field's backward pass needs only while it runs; one for all fields.
+/// Memory that a field's backward pass needs only while it runs, for m points at once; one for all fields.
 pub struct Scratch {
-    d_preactivation: Buffer<f32>, // [hidden, n] of the largest field
-    d_inputs: Buffer<f32>, // [inputs, n] of the largest field; only the hash features' rows where there is no gradient
-    steepness: Buffer<f32>, // [hidden, n] of the largest field with a gradient: s
-    tangents: Buffer<f32>, // [inputs, n] of the largest field with a gradient: ȧ
+    d_preactivation: Buffer<f32>, // [hidden, m] of the largest field
+    d_inputs: Buffer<f32>, // [inputs, m] of the largest field; only the hash features' rows where there is no gradient
+    steepness: Buffer<f32>, // [hidden, m] of the largest field with a gradient: s
+    tangents: Buffer<f32>, // [inputs, m] of the largest field with a gradient: ȧ
+}
+
+/// A stretch of points on their way back through a field.
+struct Pass<'a> {
+    params: &'a Params,
+    points: Ptr<f32>,
+    buffers: &'a FieldBuffers,
+    scratch: &'a Scratch,
+    chunk: Range<u32>,
 }
 
 impl Scratch {
@@ -172,7 +186,7 @@ impl Scratch {
         let most = |per_point: fn(&FieldShape) -> u32| {
             let sizes = users
                 .iter()
-                .map(|(shape, n)| u64::from(per_point(shape)) * u64::from(*n));
+                .map(|(shape, n)| u64::from(per_point(shape)) * u64::from((*n).min(AT_ONCE)));
             sizes.max().unwrap_or(1).max(1)
         };
         Ok(Scratch {
@@ -342,6 +356,10 @@ impl Field {
         self.table
     }
 
+    fn row_bytes(&self) -> f64 {
+        4.0 * f64::from(self.shape.inputs())
+    }
+
     fn gather_bytes(&self) -> f64 {
         32.0 * f64::from(self.shape.grid.outputs())
     }
@@ -364,14 +382,14 @@ impl Field {
         first: PtrMut<f32>,
     ) {
         let mut flops = self.hidden_flops();
-        let mut bytes = 4.0 * f64::from(self.shape.inputs());
+        let mut bytes = self.row_bytes();
         if self.apart {
             self.encode(rec, params, points, buffers);
         } else {
             flops += self.interpolation_flops();
             bytes = 2.0 * bytes + self.gather_bytes();
         }
-        for (kernel, launch) in self.forward.launches(buffers.n, buffers.n_hidden) {
+        for (kernel, launch) in self.forward.launches(0..buffers.n, buffers.n_hidden) {
             let work = Work::items(launch.len() as u64).flops(flops).bytes(bytes);
             let args = self.forward_args(params, points, buffers, first, launch);
             rec.run(kernel, work, args);
@@ -389,11 +407,10 @@ impl Field {
         let unused = buffers.inputs.ptr_mut();
         let args = self.forward_args(params, points, buffers, unused, 0..buffers.n);
         let levels = f64::from(self.shape.grid.levels);
-        let rows = 4.0 * f64::from(self.shape.inputs());
         let work = Work::items(u64::from(buffers.n))
             .slices(self.shape.grid.levels)
             .flops(self.interpolation_flops() / levels)
-            .bytes((self.gather_bytes() + rows) / levels);
+            .bytes((self.gather_bytes() + self.row_bytes()) / levels);
         rec.run(&self.encoding, work, args);
     }
 
@@ -445,13 +462,14 @@ impl Field {
             n,
         };
         let flops = 2.0 * self.hidden_flops() + 4.0 * self.interpolation_flops();
-        let bytes = self.gather_bytes() + 16.0 * f64::from(self.shape.inputs());
+        let bytes = self.gather_bytes() + 4.0 * self.row_bytes();
         let work = Work::items(u64::from(n)).flops(flops).bytes(bytes);
         rec.run(&self.kernels().gradient, work, args);
     }
 
-    /// Adds all parameter gradients, from `d_first [n]`, for the leading points the heads' `buffers.d_hidden`, and for a field with a
-    /// gradient `d_gradient` of its buffers.
+    /// Adds all parameter gradients, from `d_first [n]`, for the leading points the heads' gradients in `buffers.hidden`, and for a field
+    /// with a gradient `d_gradient` of its buffers. What such a field's points hear goes into `d_points [3, n]` where that is asked for.
+    #[allow(clippy::too_many_arguments)]
     pub fn backward(
         &self,
         rec: &mut Recorder,
@@ -460,30 +478,57 @@ impl Field {
         d_first: Ptr<f32>,
         buffers: &FieldBuffers,
         scratch: &Scratch,
+        d_points: Option<PtrMut<f32>>,
     ) {
-        let n = buffers.n;
-        let slope = buffers.slope.as_ref();
-        let items = Work::items(u64::from(n));
-        let rows = 4.0 * f64::from(self.shape.inputs());
-        if let Some(slope) = slope {
-            let args = field_tangent::Args {
-                levels: self.levels.ptr(),
-                table: params.values().ptr().offset(self.table),
+        for begin in (0..buffers.n).step_by(AT_ONCE as usize) {
+            let pass = Pass {
+                params,
                 points,
-                d_gradient: slope.d_gradient.ptr(),
-                tangents: scratch.tangents.ptr_mut(),
-                n,
+                buffers,
+                scratch,
+                chunk: begin..buffers.n.min(begin + AT_ONCE),
             };
-            let levels = f64::from(self.shape.grid.levels);
-            let by_level = items
-                .slices(self.shape.grid.levels)
-                .flops(4.0 * self.interpolation_flops() / levels);
-            rec.run(
-                &self.kernels().tangent,
-                by_level.bytes((self.gather_bytes() + rows) / levels),
-                args,
-            );
+            if let Some(slope) = &buffers.slope {
+                self.tangent(rec, &pass, slope);
+            }
+            self.network_backward(rec, &pass, d_first);
+            self.scatter(rec, &pass);
+            if let Some(d_points) = d_points {
+                self.point_backward(rec, &pass, d_points);
+            }
         }
+    }
+
+    /// ȧ = J v.
+    fn tangent(&self, rec: &mut Recorder, pass: &Pass, slope: &Slope) {
+        let args = field_tangent::Args {
+            levels: self.levels.ptr(),
+            table: pass.params.values().ptr().offset(self.table),
+            points: pass.points,
+            d_gradient: slope.d_gradient.ptr(),
+            tangents: pass.scratch.tangents.ptr_mut(),
+            n: pass.buffers.n,
+            begin: pass.chunk.start,
+            end: pass.chunk.end,
+        };
+        let levels = f64::from(self.shape.grid.levels);
+        let work = Work::items(pass.chunk.len() as u64)
+            .slices(self.shape.grid.levels)
+            .flops(4.0 * self.interpolation_flops() / levels)
+            .bytes((self.gather_bytes() + self.row_bytes()) / levels);
+        rec.run(&self.kernels().tangent, work, args);
+    }
+
+    /// Down to the network's input, and the gradients of its weights.
+    fn network_backward(&self, rec: &mut Recorder, pass: &Pass, d_first: Ptr<f32>) {
+        let Pass {
+            params,
+            buffers,
+            scratch,
+            chunk,
+            ..
+        } = pass;
+        let (n, m) = (buffers.n, chunk.len() as u32);
         let mut args = field_backward::Args {
             hidden_weight: params.weight(self.hidden, 0),
             hidden_bias: params.bias(self.hidden, 0),
@@ -491,7 +536,7 @@ impl Field {
             inputs: buffers.inputs.ptr(),
             tangents: scratch.tangents.ptr(),
             d_first,
-            d_hidden: buffers.d_hidden.ptr(),
+            d_hidden: buffers.hidden.ptr(),
             d_preactivation: scratch.d_preactivation.ptr_mut(),
             steepness: scratch.steepness.ptr_mut(),
             d_inputs: scratch.d_inputs.ptr_mut(),
@@ -500,36 +545,47 @@ impl Field {
             n,
             n_hidden: buffers.n_hidden,
             begin: 0,
-            end: n,
+            end: 0,
+            first: chunk.start,
+            m,
         };
-        let products = if slope.is_some() { 3.0 } else { 2.0 };
-        for (kernel, launch) in self.backward.launches(n, buffers.n_hidden) {
+        let products = if self.shape.gradient { 3.0 } else { 2.0 };
+        for (kernel, launch) in self.backward.launches(chunk.clone(), buffers.n_hidden) {
+            (args.begin, args.end) = (launch.start, launch.end);
             let work = Work::items(launch.len() as u64)
                 .flops(products * self.hidden_flops())
-                .bytes(products * rows + 4.0 * f64::from(self.shape.hidden));
-            (args.begin, args.end) = (launch.start, launch.end);
+                .bytes(products * self.row_bytes() + 4.0 * f64::from(self.shape.hidden));
             rec.run(kernel, work, args);
         }
+        let inputs = buffers.inputs.ptr().offset(u64::from(chunk.start));
         let d_preactivation = scratch.d_preactivation.ptr();
         self.hidden_gradient
-            .gradient(rec, params, buffers.inputs.ptr(), n, d_preactivation, n);
-        let coordinates = u64::from(self.shape.coordinate_inputs()) * u64::from(n);
-        let (d_features, slopes, d_gradient) = match slope {
-            Some(slope) => {
-                let (tangents, steepness) = (scratch.tangents.ptr(), scratch.steepness.ptr());
-                self.kernels()
-                    .steepness
-                    .gradient(rec, params, tangents, n, steepness, n);
-                (
-                    scratch.d_inputs.ptr().offset(coordinates),
-                    slope.slopes.ptr().offset(coordinates),
-                    slope.d_gradient.ptr(),
-                )
-            }
+            .gradient(rec, params, inputs, n, d_preactivation, m);
+        if let Some(kernels) = &self.by_chain_rule {
+            let (tangents, steepness) = (scratch.tangents.ptr(), scratch.steepness.ptr());
+            kernels
+                .steepness
+                .gradient(rec, params, tangents, m, steepness, m);
+        }
+    }
+
+    /// From the network's input into the table.
+    fn scatter(&self, rec: &mut Recorder, pass: &Pass) {
+        let (n, m) = (pass.buffers.n, pass.chunk.len() as u64);
+        let (begin, end) = (pass.chunk.start, pass.chunk.end);
+        let coordinates = u64::from(self.shape.coordinate_inputs());
+        let d_inputs = pass.scratch.d_inputs.ptr();
+        let points = pass.points;
+        let (d_features, slopes, d_gradient) = match &pass.buffers.slope {
+            Some(slope) => (
+                d_inputs.offset(coordinates * m),
+                slope.slopes.ptr().offset(coordinates * u64::from(n)),
+                slope.d_gradient.ptr(),
+            ),
             // Nobody reads the last two.
-            None => (scratch.d_inputs.ptr(), points, points),
+            None => (d_inputs, points, points),
         };
-        let d_table = params.grads().ptr_mut().offset(self.table);
+        let d_table = pass.params.grads().ptr_mut().offset(self.table);
         let levels = self.levels.ptr();
         let slices = self.shape.grid.levels;
         let flops = self.interpolation_flops() / f64::from(slices);
@@ -544,8 +600,11 @@ impl Field {
                     d_gradient,
                     d_table,
                     n,
+                    begin,
+                    end,
                 };
-                rec.run(kernel, items.slices(slices).flops(flops).bytes(bytes), args);
+                let work = Work::items(m).slices(slices);
+                rec.run(kernel, work.flops(flops).bytes(bytes), args);
             }
             Scatter::Owned(kernel) => {
                 let args = hash_grid_backward_owned::Args {
@@ -556,42 +615,35 @@ impl Field {
                     d_gradient,
                     d_table,
                     n,
+                    begin,
+                    end,
                 };
                 let work = Work::groups(1).slices(slices);
-                let points = f64::from(n);
-                rec.run(
-                    kernel,
-                    work.flops(flops * points).bytes(bytes * points),
-                    args,
-                );
+                let (flops, bytes) = (flops * m as f64, bytes * m as f64);
+                rec.run(kernel, work.flops(flops).bytes(bytes), args);
             }
         }
     }
 
-    /// What the points hear, into `d_points [3, n]`; right after [`Field::backward`], whose scratch memory it reads.
-    pub fn point_backward(
-        &self,
-        rec: &mut Recorder,
-        params: &Params,
-        points: Ptr<f32>,
-        buffers: &FieldBuffers,
-        scratch: &Scratch,
-        d_points: PtrMut<f32>,
-    ) {
-        let (n, slope) = (buffers.n, buffers.slope());
+    /// What the points hear.
+    fn point_backward(&self, rec: &mut Recorder, pass: &Pass, d_points: PtrMut<f32>) {
+        let slope = pass.buffers.slope();
         let args = field_point_backward::Args {
             levels: self.levels.ptr(),
-            table: params.values().ptr().offset(self.table),
-            points,
-            d_inputs: scratch.d_inputs.ptr(),
+            table: pass.params.values().ptr().offset(self.table),
+            points: pass.points,
+            d_inputs: pass.scratch.d_inputs.ptr(),
             slopes: slope.slopes.ptr(),
             d_gradient: slope.d_gradient.ptr(),
             d_points,
-            n,
+            n: pass.buffers.n,
+            begin: pass.chunk.start,
+            end: pass.chunk.end,
         };
-        let work = Work::items(u64::from(n)).flops(8.0 * self.interpolation_flops());
-        let bytes = self.gather_bytes() + 8.0 * f64::from(self.shape.inputs());
-        rec.run(&self.kernels().points, work.bytes(bytes), args);
+        let work = Work::items(pass.chunk.len() as u64)
+            .flops(8.0 * self.interpolation_flops())
+            .bytes(self.gather_bytes() + 2.0 * self.row_bytes());
+        rec.run(&self.kernels().points, work, args);
     }
 
     fn kernels(&self) -> &GradientKernels {

@@ -126,6 +126,7 @@ impl Proposal {
             b.d_raw.ptr(),
             &b.field,
             scratch,
+            None,
         );
     }
 }

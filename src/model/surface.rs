@@ -45,12 +45,11 @@ pub struct SurfaceBuffers {
     pub d_sdf: Buffer<f32>,  // [blocks, n]
     pub shading: Buffer<f32>, // [rows, n] glsl/lib/shading.glsl; row 0 is the scale logit
     pub d_shading: Buffer<f32>, // [rows that receive gradients, n]
-    pub hidden: Vec<Buffer<f32>>, // per hidden colour layer [width, n]
-    pub d_hidden: Vec<Buffer<f32>>,
-    pub rgb: Buffer<f32>,       // [3, n] sigmoid output, not padded
-    pub d_rgb: Buffer<f32>,     // [3, n]
-    pub eikonal: Buffer<f32>,   // [n]
-    pub curvature: Buffer<f32>, // [n] weighted, where there is a curvature loss
+    pub hidden: Vec<Buffer<f32>>, // per hidden colour layer [width, n]; in the backward pass its gradient takes its place
+    pub rgb: Buffer<f32>,         // [3, n] sigmoid output, not padded
+    pub d_rgb: Buffer<f32>,       // [3, n]
+    pub eikonal: Buffer<f32>,     // [n]
+    pub curvature: Buffer<f32>,   // [n] weighted, where there is a curvature loss
     /// What the taps' gradient hears from the density, where that reads it.
     tap_d_gradient: Option<Buffer<f32>>, // [3, n]
 }
@@ -312,11 +311,8 @@ impl Surface {
         let (n64, blocks) = (u64::from(n), self.blocks());
         let width = |layer: usize| self.colors[layer].outputs();
         let hidden_layers = self.colors.len() - 1;
-        let layer_buffers = |name: &str| -> Result<Vec<Buffer<f32>>> {
-            (0..hidden_layers)
-                .map(|l| gpu.scratch(&format!("{name} {l}"), u64::from(width(l)) * n64))
-                .collect()
-        };
+        let hidden = (0..hidden_layers)
+            .map(|l| gpu.scratch(&format!("color hidden {l}"), u64::from(width(l)) * n64));
         let rows = u64::from(self.gradient_rows() + 3 + DIRECTION_ENCODING);
         Ok(SurfaceBuffers {
             n,
@@ -326,8 +322,7 @@ impl Surface {
             d_sdf: gpu.scratch("d_sdf", u64::from(blocks) * n64)?,
             shading: gpu.scratch("shading", rows * n64)?,
             d_shading: gpu.scratch("d_shading", u64::from(self.gradient_rows()) * n64)?,
-            hidden: layer_buffers("color hidden")?,
-            d_hidden: layer_buffers("color d_hidden")?,
+            hidden: hidden.collect::<Result<_>>()?,
             rgb: gpu.scratch("rgb", 3 * n64)?,
             d_rgb: gpu.scratch("d_rgb", 3 * n64)?,
             eikonal: gpu.scratch("eikonal", n64)?,
@@ -424,7 +419,7 @@ impl Surface {
                     self.color_inputs(b),
                     b.d_shading.ptr_mut().offset(u64::from(n)),
                 ),
-                _ => (b.hidden[layer - 1].ptr(), b.d_hidden[layer - 1].ptr_mut()),
+                _ => (b.hidden[layer - 1].ptr(), b.hidden[layer - 1].ptr_mut()),
             };
             color.gradient(rec, params, x, n, d_y, n);
             color.backward(rec, params, d_y, x, d_x, n);
@@ -466,17 +461,11 @@ impl Surface {
                 args,
             );
         }
-        let hidden = b.field.hidden.ptr();
+        let (hidden, d_hidden) = (b.field.hidden.ptr(), b.field.hidden.ptr_mut());
         self.heads
             .gradient(rec, params, hidden, n, b.d_shading.ptr(), n);
-        self.heads.backward(
-            rec,
-            params,
-            b.d_shading.ptr(),
-            hidden,
-            b.field.d_hidden.ptr_mut(),
-            n,
-        );
+        self.heads
+            .backward(rec, params, b.d_shading.ptr(), hidden, d_hidden, n);
         self.field.backward(
             rec,
             params,
@@ -484,6 +473,7 @@ impl Surface {
             b.d_sdf.ptr(),
             &b.field,
             scratch,
+            None,
         );
     }
 

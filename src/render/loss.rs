@@ -187,6 +187,7 @@ impl Loss {
             self.d_query_sdf.ptr(),
             &self.query_field,
             scratch,
+            None,
         );
     }
 

@@ -80,9 +80,8 @@ impl Tangent {
             scale: self.weight / n as f32,
         };
         rec.run(&self.compare, per_sample, args);
-        field.backward(rec, params, points, self.d_sdf.ptr(), &self.field, scratch);
-        let d_points = self.d_points.ptr_mut();
-        field.point_backward(rec, params, points, &self.field, scratch, d_points);
+        let (d_sdf, d_points) = (self.d_sdf.ptr(), Some(self.d_points.ptr_mut()));
+        field.backward(rec, params, points, d_sdf, &self.field, scratch, d_points);
         let args = tangent_points_backward::Args {
             gradient: at_samples.gradient.ptr(),
             draws: draws.per_sample(),

@@ -1,5 +1,6 @@
 //! Every kernel against a slow twin in float64, and against arrays of the published implementation.
 
+mod field_chunks;
 mod harness;
 mod lazy_table;
 #[path = "../reference/optimizer.rs"]

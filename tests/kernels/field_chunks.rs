@@ -1,0 +1,137 @@
+//! A field's backward pass over more points than it takes at once, and over points with heads and without, is the sum of passes over
+//! fewer.
+
+use crate::harness::{assert_gradient, device};
+use neurodin::Result;
+use neurodin::gpu::Gpu;
+use neurodin::model::{
+    Field, FieldBuffers, FieldShape, Group, HashGrid, Init, Params, ParamsPlan, Scratch,
+};
+
+const SHAPE: FieldShape = FieldShape {
+    grid: HashGrid {
+        levels: 3,
+        base: 4,
+        max: 16,
+        log2_size: 9,
+        features: 2,
+    },
+    hidden: 8,
+    coordinates: true,
+    softplus: true,
+    gradient: true,
+};
+const POINTS: usize = 70_001;
+/// Leading points with heads.
+const WITH_HEADS: usize = 66_000;
+
+/// A number in [-1, 1) for each index.
+fn noise(of: u32, i: usize) -> f32 {
+    let mixed = (i as u32 ^ of.wrapping_mul(0x9e37_79b9)).wrapping_mul(0x85eb_ca6b);
+    ((mixed ^ (mixed >> 15)).wrapping_mul(0xc2b2_ae35) >> 8) as f32 / (1 << 23) as f32 - 1.0
+}
+
+/// Columns `range` of a planar array of `rows` rows that is defined for all points.
+fn planes(of: u32, rows: usize, scale: f32, range: std::ops::Range<usize>) -> Vec<f32> {
+    let rows = 0..rows;
+    rows.flat_map(|row| {
+        range
+            .clone()
+            .map(move |i| scale * noise(of, row * POINTS + i))
+    })
+    .collect()
+}
+
+fn field(gpu: &Gpu) -> Result<(Field, Params)> {
+    let mut plan = ParamsPlan::default();
+    let (hidden, inputs) = (SHAPE.hidden, SHAPE.inputs());
+    let table = [SHAPE.grid.entries(), u64::from(SHAPE.grid.features)];
+    let values = |of, n| (0..n).map(|i| 0.3 * noise(of, i)).collect::<Vec<f32>>();
+    let entries = values(1, (table[0] * table[1]) as usize);
+    let table = plan.add(Group::Table, "table", &table, Init::Values(entries));
+    let mut matrix = |name, of, rows: u32, columns: u32| {
+        let weights = values(of, (rows * columns) as usize);
+        plan.add_plain(Group::Fields, name, rows.into(), columns.into(), weights)
+    };
+    let first = matrix("hidden", 2, hidden, inputs);
+    let head = matrix("head", 3, 1, hidden);
+    let field = Field::new(gpu, "chunks", SHAPE, table, first, head)?;
+    Ok((field, plan.build(gpu, 1, true)?))
+}
+
+/// Adds the gradients of these points to `params`' and returns what the points hear.
+fn backward(
+    gpu: &Gpu,
+    (field, params): &(Field, Params),
+    range: std::ops::Range<usize>,
+) -> Result<Vec<f32>> {
+    let n = range.len() as u32;
+    let with_heads = range.start.min(WITH_HEADS)..range.end.min(WITH_HEADS);
+    let n_hidden = with_heads.len() as u32;
+    let buffers = FieldBuffers::new(gpu, "chunks", &SHAPE, n, n_hidden)?;
+    let scratch = Scratch::new(gpu, &[(SHAPE, n)])?;
+    let filled = |name: &str, values: &[f32]| {
+        let buffer = gpu.buffer(name, values.len() as u64)?;
+        gpu.upload(&buffer, 0, values).map(|()| buffer)
+    };
+    let points = filled("points", &planes(4, 3, 0.9, range.clone()))?;
+    let d_first = filled("d_first", &planes(5, 1, 1.0, range.clone()))?;
+    let first = gpu.buffer::<f32>("first", u64::from(n))?;
+    let d_points = gpu.buffer::<f32>("d_points", 3 * u64::from(n))?;
+    gpu.submit("forward", |rec| {
+        field.forward(rec, params, points.ptr(), &buffers, first.ptr_mut());
+        field.gradient(rec, params, points.ptr(), &buffers);
+        Ok(())
+    })?;
+    let d_gradient = planes(6, 3, 0.1, range);
+    gpu.upload(&buffers.slope().d_gradient, 0, &d_gradient)?;
+    let d_hidden = planes(7, SHAPE.hidden as usize, 1.0, with_heads);
+    gpu.upload(&buffers.hidden, 0, &d_hidden)?;
+    gpu.submit("backward", |rec| {
+        let hear = Some(d_points.ptr_mut());
+        field.backward(
+            rec,
+            params,
+            points.ptr(),
+            d_first.ptr(),
+            &buffers,
+            &scratch,
+            hear,
+        );
+        Ok(())
+    })?;
+    gpu.download(&d_points, 0, d_points.len())
+}
+
+#[test]
+fn many_points_are_the_sum_of_fewer() -> Result<()> {
+    let gpu = &device().gpu;
+    let (whole, parts) = (field(gpu)?, field(gpu)?);
+    let d_points = backward(gpu, &whole, 0..POINTS)?;
+    let cut = 40_000;
+    let of_parts = [
+        backward(gpu, &parts, 0..cut)?,
+        backward(gpu, &parts, cut..POINTS)?,
+    ];
+    let wide = |values: &[f32]| values.iter().map(|&x| f64::from(x)).collect::<Vec<f64>>();
+    for axis in 0..3 {
+        let joined = of_parts.iter().flat_map(|part| {
+            let n = part.len() / 3;
+            &part[axis * n..(axis + 1) * n]
+        });
+        let joined: Vec<f32> = joined.copied().collect();
+        let row = &d_points[axis * POINTS..(axis + 1) * POINTS];
+        assert_gradient("what the points hear", &wide(row), &wide(&joined));
+    }
+    let [of_whole, of_parts] = [&whole.1, &parts.1].map(|params| {
+        let grads = params.grads();
+        gpu.download(grads, 0, grads.len()).map(|g| wide(&g))
+    });
+    let (of_whole, of_parts) = (of_whole?, of_parts?);
+    for span in whole.1.spans() {
+        let range = span.first as usize..(span.first + span.len()) as usize;
+        assert!(of_parts[range.clone()].iter().any(|&g| g != 0.0));
+        assert_gradient(&span.name, &of_whole[range.clone()], &of_parts[range]);
+    }
+    Ok(())
+}
