@@ -23,6 +23,10 @@ use std::{env, fs};
 const RECIPE: &str = "vulkan 1.2, spir-v 1.5, unoptimised, 1";
 /// Defined for the second variant of a kernel: Vulkan 1.2 without what is optional there.
 const CORE_ONLY: &str = "CORE_ONLY";
+/// Defined for the third variant of a kernel that handles gradients: their sums do not depend on the order.
+const DETERMINISTIC: &str = "DETERMINISTIC";
+/// The pointer type of gradients (lib/prelude.glsl).
+const SUMS: &str = "SumsMut";
 /// Every implementation has this much, and lavapipe of 2022 no more.
 const PUSH_CONSTANT_BYTES: u32 = 128;
 
@@ -114,6 +118,9 @@ fn kernel(
             ));
         }
     }
+    if source.names(SUMS) {
+        compiled(&source, stem, DETERMINISTIC, out)?;
+    }
     for (name, layout) in &module.structs {
         match structs.get(name) {
             Some((other, known)) if known.fields != layout.fields => {
@@ -152,6 +159,12 @@ impl Source {
             .map(|line| line.trim_start_matches('/').trim().to_string())
             .collect();
         Ok(source)
+    }
+
+    /// Whether the kernel's own text does, beyond the prelude that all have.
+    fn names(&self, word: &str) -> bool {
+        let mut lines = self.text.lines().zip(&self.lines);
+        lines.any(|(line, (file, _))| file != "lib/prelude.glsl" && line.contains(word))
     }
 
     /// Appends a file; names in `#include "..."` are looked for beside the file, then under glsl/. Each file enters once.
@@ -365,6 +378,10 @@ fn rust_module(stem: &str, source: &Source, module: &Module) -> Result<String, S
         true => format!("Some({})", embed(CORE_ONLY)),
         false => "None".into(),
     };
+    let deterministic = match source.names(SUMS) {
+        true => format!("Some({})", embed(DETERMINISTIC)),
+        false => "None".into(),
+    };
     let mut pointers = String::new();
     for field in &module.args {
         if let Type::Pointer { writable, .. } = field.ty {
@@ -378,7 +395,7 @@ fn rust_module(stem: &str, source: &Source, module: &Module) -> Result<String, S
     let _ = writeln!(
         w,
         "pub(super) static MODULE: crate::gpu::KernelModule = crate::gpu::KernelModule {{ name: {stem:?}, local_size: {:?}, spirv: {}, \
-         spirv_of_core: {fallback}, pointers: &[{pointers}], indirect_reads: {}, indirect_writes: {} }};\n}}",
+         spirv_of_core: {fallback}, deterministic_spirv: {deterministic}, pointers: &[{pointers}], indirect_reads: {}, indirect_writes: {} }};\n}}",
         module.local_size,
         embed(""),
         module.indirect_reads,

@@ -6,7 +6,7 @@
 
 layout(push_constant, scalar) uniform Args {
     F32sMut params;       // [n] updated in place
-    F32sMut grads;        // [n] consumed: zeroed for the next step
+    SumsMut grads;        // [n] consumed: zeroed for the next step
     F32sMut first_moment; // [n]
     F32sMut second_moment; // [n]
     U32s bad_step;        // [1] non-zero: losses not finite

@@ -5,7 +5,7 @@
 layout(push_constant, scalar) uniform Args {
     F32s d_code;         // [channels, n_rays * n_samples]
     U32s ray_view;       // [n_rays]
-    F32sMut d_appearance; // [views, channels] accumulated
+    SumsMut d_appearance; // [views, channels] accumulated
     uint n_rays;
     uint n_samples;
     uint channels;

@@ -5,7 +5,7 @@
 layout(push_constant, scalar) uniform Args {
     F32s logits;       // [3]
     F32s d_color;      // [3, n_rays]
-    F32sMut d_logits;  // [3] accumulated
+    SumsMut d_logits;  // [3] accumulated
     uint n_rays;
 };
 
@@ -23,6 +23,6 @@ void main() {
         float sum = 0.0;
         for (uint i = 0u; i < gl_WorkGroupSize.x; ++i) sum += partial[lane * gl_WorkGroupSize.x + i];
         float y = 1.0 / (1.0 + exp(-logits.at[lane]));
-        d_logits.at[lane] += sum * y * (1.0 - y);
+        add_alone(d_logits, lane, sum * y * (1.0 - y));
     }
 }

@@ -22,8 +22,8 @@ layout(push_constant, scalar) uniform Args {
     F32sMut d_preactivation; // [HIDDEN, m] d_u
     F32sMut steepness;       // [HIDDEN, m] s, with SECOND_ORDER
     F32sMut d_inputs;        // [INPUTS, m] d_z; without SECOND_ORDER [LEVELS * FEATURES, m] d_e
-    F32sMut d_head_weight;   // [HIDDEN] accumulated
-    F32sMut d_head_bias;     // [1] accumulated
+    SumsMut d_head_weight;   // [HIDDEN] accumulated
+    SumsMut d_head_bias;     // [1] accumulated
     uint n;
     uint n_hidden;
     uint begin;              // the points of this launch

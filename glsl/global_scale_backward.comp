@@ -6,7 +6,7 @@
 
 layout(push_constant, scalar) uniform Args {
     F32sMut d_scale;     // [n] consumed
-    F32sMut d_parameter; // [1] accumulated
+    SumsMut d_parameter; // [1] accumulated
     uint n;
 };
 
@@ -25,5 +25,5 @@ void main() {
         if (lane < stride) partial[lane] += partial[lane + stride];
         barrier();
     }
-    if (lane == 0u) d_parameter.at[0] += partial[0];
+    if (lane == 0u) add_alone(d_parameter, 0u, partial[0]);
 }

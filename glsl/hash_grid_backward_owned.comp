@@ -19,7 +19,7 @@ void scatter(Level level, uint l, uint point) {
     } else {
         [[unroll]] for (uint k = 0u; k < PAIRS; ++k) {
             vec2 more = vec2(added(factors, 2u * k), FEATURES == 1u ? 0.0 : added(factors, 2u * k + 1u));
-            store_features(d_table, entry, k, load_features(reading(d_table), entry, k) + more);
+            add_alone(d_table, entry, k, more);
         }
     }
     // The next point's corners may be this one's, in other lanes.

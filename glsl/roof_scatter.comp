@@ -3,7 +3,7 @@
 // Adds to entries of eight floats at random in a table, 16 per invocation, by atomics: the fastest that a hash grid's gradient can be
 // scattered without aggregating it first. Measures the roof for tables of one size.
 layout(push_constant, scalar) uniform Args {
-    F32sMut table;  // [entries, 8] accumulated
+    SumsMut table;  // [entries, 8] accumulated
     uint n;
     uint mask;      // entries - 1, entries a power of two
 };

@@ -17,7 +17,7 @@ layout(push_constant, scalar) uniform Args {
     U32s clock;             // [1]
     U32s bad_step;          // [1] non-zero: losses not finite
     F32sMut table;          // [entries, FEATURES]
-    F32sMut grads;          // [entries, FEATURES] zero where nobody marked
+    SumsMut grads;          // [entries, FEATURES] zero where nobody marked
     F32sMut first_moment;   // [entries, FEATURES]
     F32sMut second_moment;  // [entries, FEATURES]
     U32sMut marks;          // [slots / 32] a bit each
@@ -45,7 +45,7 @@ void update_stale(uint entry, uint slot, bool marked) {
     if (stamp != now) lag = lags.at[stamp];
     [[unroll]] for (uint k = 0u; k < PAIRS; ++k) {
         vec2 p = load_features(reading(table), entry, k);
-        vec2 g = load_features(reading(grads), entry, k);
+        vec2 g = load_sums(grads, entry, k);
         vec2 m = load_features(reading(first_moment), entry, k);
         vec2 v = load_features(reading(second_moment), entry, k);
         [[unroll]] for (uint f = 0u; f < 2u; ++f) {
@@ -58,7 +58,7 @@ void update_stale(uint entry, uint slot, bool marked) {
             m[f] = x.m;
             v[f] = x.v;
         }
-        if (marked) store_features(grads, entry, k, vec2(0.0));
+        if (marked) clear_sums(grads, entry, k);
         store_features(table, entry, k, p);
         store_features(first_moment, entry, k, m);
         store_features(second_moment, entry, k, v);

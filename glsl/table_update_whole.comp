@@ -12,7 +12,7 @@ layout(push_constant, scalar) uniform Args {
     U32s clock;             // [1]
     U32s bad_step;          // [1] non-zero: losses not finite
     F32sMut table;          // [entries, FEATURES]
-    F32sMut grads;          // [entries, FEATURES] consumed
+    SumsMut grads;          // [entries, FEATURES] consumed
     F32sMut first_moment;   // [entries, FEATURES]
     F32sMut second_moment;  // [entries, FEATURES]
     U32sMut stamps;         // [slots / 4] a byte each

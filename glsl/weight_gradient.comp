@@ -13,8 +13,8 @@ const uint SAMPLES = 4u;  // per turn of the loop
 layout(push_constant, scalar) uniform Args {
     F32s x;            // [INPUTS, n]
     F32s d_y;          // [OUTPUTS, n]
-    F32sMut d_weight;  // [OUTPUTS, INPUTS] accumulated
-    F32sMut d_bias;    // [OUTPUTS] accumulated
+    SumsMut d_weight;  // [OUTPUTS, INPUTS] accumulated
+    SumsMut d_bias;    // [OUTPUTS] accumulated
     uint n;
     uint stride_x;     // samples between channels of x (x may be the front part of a longer buffer)
     uint chunk;        // samples per workgroup

@@ -7,8 +7,8 @@
 layout(push_constant, scalar) uniform Args {
     WeightRows rows;     // [n]
     F32s params;
-    F32sMut d_weights;   // consumed
-    F32sMut d_params;    // accumulated
+    SumsMut d_weights;   // consumed
+    SumsMut d_params;    // accumulated
     uint n;
     uint released_columns;
 };
@@ -23,14 +23,15 @@ void main() {
     for (uint i = 0u; i < row.columns; ++i) {
         float v = params.at[row.v + i];
         square = fma(v, v, square);
-        if (i < acting) along = fma(v, d_weights.at[row.weight + i], along);
+        if (i < acting) along = fma(v, sum_at(d_weights, row.weight + i), along);
     }
     float inverse = inversesqrt(square);
     along *= inverse;
-    d_params.at[row.g] += along;
+    add_alone(d_params, row.g, along);
     float scale = params.at[row.g] * inverse;
     for (uint i = 0u; i < row.columns; ++i) {
-        d_params.at[row.v + i] += scale * ((i < acting ? d_weights.at[row.weight + i] : 0.0) - along * inverse * params.at[row.v + i]);
-        d_weights.at[row.weight + i] = 0.0;
+        float d_weight = i < acting ? sum_at(d_weights, row.weight + i) : 0.0;
+        add_alone(d_params, row.v + i, scale * (d_weight - along * inverse * params.at[row.v + i]));
+        clear(d_weights, row.weight + i);
     }
 }

@@ -23,6 +23,8 @@ pub struct Config {
     pub method: String,
     /// Seed of every random number: initial parameters, pixels, jitter, taps.
     pub seed: u32,
+    /// The same run comes out in the same bits, on one device: gradients add up in fixed point, and no clock decides what is computed.
+    pub deterministic: bool,
     /// Length of the stage. The schedules below are written for `schedule_steps` and stretched to this.
     pub steps: u64,
     /// Steps of the stage before it: the number that its own first step has.

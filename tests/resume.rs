@@ -48,16 +48,7 @@ fn a_restored_run_takes_the_same_next_step() {
     let folder = tempfile::tempdir().unwrap();
     let scene = scene(folder.path());
     let region = sphere(1.1);
-    // Every kind of parameter there is: codes, a background field, both proposals, and a table of which a step leaves a part alone.
-    let config = Config::preset("outdoor-tiny")
-        .and_then(|config| {
-            config.with_toml(
-                "steps = 40\nrays = 32\nappearance.dims = 8\nbackground.kind = 'field'\nbackground.samples = 8\nhash.levels = 4\nhash.log2_size = 17",
-                "test",
-            )
-        })
-        .and_then(Config::validated)
-        .unwrap();
+    let config = of_every_kind();
     let gpu = Gpu::new(&GpuOptions::default()).unwrap();
     let mut first = Trainer::new(&gpu, &scene, &region, &config).unwrap();
     for _ in 0..6 {
@@ -94,6 +85,79 @@ fn a_restored_run_takes_the_same_next_step() {
         first.values.iter().all(|value| value.is_finite()),
         "{first:?}"
     );
+}
+
+/// Every kind of parameter there is: codes, a background field, both proposals, and a table of which a step leaves a part alone.
+fn of_every_kind() -> Config {
+    let settings = "steps = 40\nrays = 32\nappearance.dims = 8\nbackground.kind = 'field'\nbackground.samples = 8\nhash.levels = 4\nhash.log2_size = 17";
+    Config::preset("outdoor-tiny")
+        .and_then(|config| config.with_toml(settings, "test"))
+        .and_then(Config::validated)
+        .unwrap()
+}
+
+#[test]
+fn deterministic_runs_are_the_same_to_the_bit() {
+    let folder = tempfile::tempdir().unwrap();
+    let scene = scene(folder.path());
+    let region = sphere(1.1);
+    let gpu = |deterministic| {
+        Gpu::new(&GpuOptions {
+            deterministic,
+            validation: true,
+            guard: true,
+            ..GpuOptions::default()
+        })
+        .unwrap()
+    };
+    let (fixed, floating) = (gpu(true), gpu(false));
+    let one = of_every_kind();
+    let two = one.second_stage().unwrap();
+    for (stage, config) in [("1", one), ("2", two)] {
+        let trained = |gpu: &Gpu, name: &str, from: Option<&Checkpoint>, steps: u64| {
+            let mut trainer = Trainer::new(gpu, &scene, &region, &config).unwrap();
+            if let Some(from) = from {
+                trainer.restore(from).unwrap();
+            }
+            for _ in 0..steps {
+                trainer.step().unwrap();
+            }
+            trainer.finish().unwrap();
+            let saved = trainer.save(&folder.path().join(stage).join(name)).unwrap();
+            Checkpoint::open(&saved).unwrap()
+        };
+        let bytes = |checkpoint: &Checkpoint| fs::read(checkpoint.path()).unwrap();
+        let middle = trained(&fixed, "middle", None, 8);
+        let again = trained(&fixed, "again", None, 8);
+        assert!(bytes(&middle) == bytes(&again), "stage {stage}: run again");
+        let end = trained(&fixed, "end", Some(&middle), 8);
+        let resumed = trained(&fixed, "resumed", Some(&again), 8);
+        assert!(bytes(&end) == bytes(&resumed), "stage {stage}: resumed");
+
+        // After one step the first moments are gradients.
+        let gradients = |gpu: &Gpu, name: &str| -> Vec<f64> {
+            let checkpoint = trained(gpu, name, None, 1);
+            let spans = ["surface.table", "surface.hidden.v", "proposal.0.table"].iter();
+            spans
+                .flat_map(|span| {
+                    let (_, values) = checkpoint.tensor(&format!("first_moment.{span}")).unwrap();
+                    values.iter().map(|&x| f64::from(x)).collect::<Vec<_>>()
+                })
+                .collect()
+        };
+        let (sums, floats) = (gradients(&fixed, "fixed"), gradients(&floating, "floating"));
+        let pairs = sums.iter().zip(&floats);
+        let error: f64 = pairs.map(|(a, b)| (a - b).powi(2)).sum();
+        let norm: f64 = floats.iter().map(|b| b.powi(2)).sum();
+        assert!(
+            norm > 0.0 && error <= 1e-10 * norm,
+            "stage {stage}: {error:e} of {norm:e}"
+        );
+    }
+    for gpu in [fixed, floating] {
+        gpu.check_guards().unwrap();
+        assert_eq!(gpu.validation_messages(), Vec::<String>::new());
+    }
 }
 
 #[test]

@@ -24,9 +24,9 @@ Moving adam_step(Moving x, float g, Rates r) {
 }
 
 // The step of two parameters from an even index i on; their gradients are consumed. A bad step changes nothing else.
-void update_pair(F32sMut params, F32sMut grads, F32sMut first_moment, F32sMut second_moment, uint i, bool bad, Rates rates) {
-    vec2 g = pair_at(reading(grads), i);
-    set_pair(grads, i, vec2(0.0));
+void update_pair(F32sMut params, SumsMut grads, F32sMut first_moment, F32sMut second_moment, uint i, bool bad, Rates rates) {
+    vec2 g = sums_at(grads, i);
+    clear_pair(grads, i);
     if (bad) return;
     vec2 p = pair_at(reading(params), i);
     vec2 m = pair_at(reading(first_moment), i);

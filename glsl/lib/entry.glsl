@@ -13,3 +13,24 @@ void store_features(F32sMut table, uint entry, uint pair, vec2 x) {
         set_pair(table, entry * FEATURES + 2u * pair, x);
     }
 }
+
+// The same of an entry's gradient.
+vec2 load_sums(SumsMut grads, uint entry, uint pair) {
+    return FEATURES == 1u ? vec2(sum_at(grads, entry), 0.0) : sums_at(grads, entry * FEATURES + 2u * pair);
+}
+
+void clear_sums(SumsMut grads, uint entry, uint pair) {
+    if (FEATURES == 1u) {
+        clear(grads, entry);
+    } else {
+        clear_pair(grads, entry * FEATURES + 2u * pair);
+    }
+}
+
+void add_alone(SumsMut grads, uint entry, uint pair, vec2 v) {
+    if (FEATURES == 1u) {
+        add_alone(grads, entry, v.x);
+    } else {
+        add_pair_alone(grads, entry * FEATURES + 2u * pair, v);
+    }
+}

@@ -10,7 +10,7 @@ layout(push_constant, scalar) uniform Args {
     F32s d_features;  // [LEVELS * FEATURES, end - begin] d_e
     F32s slopes;      // [LEVELS * FEATURES, n] a, with SECOND_ORDER
     F32s d_gradient;  // [3, n] v = ∂loss/∂g, with SECOND_ORDER
-    F32sMut d_table;  // [entries, FEATURES] accumulated
+    SumsMut d_table;  // [entries, FEATURES] accumulated
     uint n;
     uint begin;       // the points at hand
     uint end;

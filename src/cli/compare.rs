@@ -96,6 +96,8 @@ struct Scores {
 
 pub(super) fn run(args: &CompareArgs, context: &Context) -> anyhow::Result<()> {
     let methods = methods(&args.methods)?;
+    // Hours may pass until it is needed.
+    eval::read_reference(&args.reference)?;
     let mut table = Table::default();
     // All methods under one seed, then under the next: a study that is stopped has compared.
     for nth in 0..args.seeds {

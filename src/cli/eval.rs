@@ -155,7 +155,8 @@ fn corners([x0, y0, z0, x1, y1, z1]: [f64; 6]) -> [DVec3; 2] {
     bounds(&[DVec3::new(x0, y0, z0), DVec3::new(x1, y1, z1)]).expect("two corners")
 }
 
-fn read_reference(paths: &[PathBuf]) -> Result<Reference> {
+/// The true surface: one mesh, one point cloud, or one of each.
+pub(super) fn read_reference(paths: &[PathBuf]) -> Result<Reference> {
     let mut reference = Reference::default();
     for path in paths {
         let part = Reference::from_mesh(read_mesh(path)?);

@@ -4,7 +4,7 @@ use super::progress::Progress;
 use super::scene_args::SceneArgs;
 use super::settings::SettingsArgs;
 use super::timing::{Until, time};
-use super::train::{configure, open_scene, region_wanted};
+use super::train::{configure, gpu_options, open_scene, region_wanted};
 use super::{Context, interrupt};
 use crate::gpu::{GpuOptions, Profile};
 use crate::scene::Region;
@@ -78,7 +78,7 @@ pub(super) fn run(args: &ProfileArgs, context: &Context) -> anyhow::Result<()> {
     let region = Region::estimate(&scene, &region_wanted(&args.scene, &config))?;
     let gpu = context.gpu_with(GpuOptions {
         profile: true,
-        ..GpuOptions::default()
+        ..gpu_options(&config)
     })?;
     context.say(&format!("preset   {}{}", config.preset, chosen.why));
     context.say(&format!("device   {}", gpu.info().name));

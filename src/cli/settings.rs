@@ -27,6 +27,9 @@ pub(super) struct SettingsArgs {
     /// Seed of every random number
     #[arg(long, value_name = "N", env = "NEURODIN_SEED")]
     pub seed: Option<u32>,
+    /// The same run comes out in the same bits, on one device (what it costs: tools/runs/throughput.md)
+    #[arg(long)]
+    pub deterministic: bool,
     /// One setting, for example hash.log2_size=22; may be given several times
     #[arg(long, value_name = "KEY=VALUE")]
     pub set: Vec<String>,
@@ -96,6 +99,7 @@ impl SettingsArgs {
         if let Some(seed) = self.seed {
             config.seed = seed;
         }
+        config.deterministic |= self.deterministic;
         config.validated()
     }
 

@@ -6,7 +6,7 @@ use super::settings::SettingsArgs;
 use super::suggestion::Suggestion;
 use super::{Context, diagnostics, interrupt};
 use crate::config::{Config, Effect, MaskUse, RegionKind};
-use crate::gpu::Gpu;
+use crate::gpu::{Gpu, GpuOptions};
 use crate::scene::{Region, RegionOverrides, RegionShape, Scene, Split};
 use crate::train::Trainer;
 use crate::train::checkpoint::{self, Latest};
@@ -234,7 +234,7 @@ fn begin(args: &TrainArgs, out: &Path, context: &Context) -> anyhow::Result<Task
     for doubt in &chosen.doubts {
         context.warn(doubt);
     }
-    let gpu = context.gpu()?;
+    let gpu = context.gpu_with(gpu_options(&config))?;
     let trainer = Trainer::new(&gpu, &scene, &region, &config)?;
     say_device(&gpu, args.dry_run, context);
     Ok(Task {
@@ -284,6 +284,14 @@ fn in_words(region: &Region) -> String {
         "{shape} about ({:.4}, {:.4}, {:.4}), {}",
         center.x, center.y, center.z, region.how
     )
+}
+
+/// How a configuration wants its device to work.
+pub(super) fn gpu_options(config: &Config) -> GpuOptions {
+    GpuOptions {
+        deterministic: config.deterministic,
+        ..GpuOptions::default()
+    }
 }
 
 /// A run that is gone on with.
@@ -373,7 +381,7 @@ fn resume(args: &TrainArgs, out: &Path, context: &Context) -> anyhow::Result<Tas
     ));
     let record = SceneRecord::load(&run)?;
     let scene = record.open(args.dataset.as_deref(), &config)?;
-    let gpu = context.gpu()?;
+    let gpu = context.gpu_with(gpu_options(&config))?;
     let mut trainer = Trainer::new(&gpu, &scene, &state.region, &config)?;
     trainer.restore(&latest.checkpoint)?;
     say_device(&gpu, args.dry_run, context);

@@ -27,6 +27,9 @@ pub struct GpuOptions {
     pub profile: bool,
     /// Ignores what only some devices offer, so that the variants run that run everywhere.
     pub portable: bool,
+    /// Adds gradients up so that their order does not count: the same run comes out in the same bits, on one device. Needs 64-bit
+    /// atomics, which `portable` leaves alone.
+    pub deterministic: bool,
     /// Bytes of device memory that buffers may take; `None`: what the device has.
     pub memory_limit: Option<u64>,
     /// Folder that keeps compiled pipelines from one run to the next; `None` keeps none. (Software drivers have their own cache and
@@ -89,6 +92,15 @@ impl Gpu {
             info.few_cores = false;
             info.full_subgroups = None;
         }
+        if options.deterministic && !(info.int64 && info.int64_atomics) {
+            return Err(Error::NoDevice {
+                what: format!(
+                    "{} adds no 64-bit integers atomically, which deterministic training needs
+  next: train without --deterministic, or on another device",
+                    info.name
+                ),
+            });
+        }
         let context = Context::new(instance, physical, &info)?;
         let memory = Memory::new(&context, options.memory_limit)?;
         let pipelines = Pipelines::new(&context, &info, options.cache_dir.as_deref())?;
@@ -128,6 +140,11 @@ impl Gpu {
     /// The device in use.
     pub fn info(&self) -> &DeviceInfo {
         &self.inner.info
+    }
+
+    /// Whether gradients are summed up in fixed point; see [`GpuOptions::deterministic`].
+    pub fn deterministic(&self) -> bool {
+        self.inner.options.deterministic
     }
 
     /// What the validation layer has said so far; nothing where the device was opened without [`GpuOptions::validation`].
@@ -202,7 +219,8 @@ impl Context {
         let mut twelve = vk::PhysicalDeviceVulkan12Features::default()
             .buffer_device_address(true)
             .scalar_block_layout(true)
-            .timeline_semaphore(true);
+            .timeline_semaphore(true)
+            .shader_buffer_int64_atomics(info.int64_atomics);
         let mut atomics = vk::PhysicalDeviceShaderAtomicFloatFeaturesEXT::default()
             .shader_buffer_float32_atomic_add(true);
         let mut control = vk::PhysicalDeviceSubgroupSizeControlFeatures::default()

@@ -60,6 +60,7 @@ pub struct DeviceInfo {
     /// What this device lacks to run the kernels; empty where it can.
     pub missing: Vec<String>,
     pub(super) int64: bool,
+    pub(super) int64_atomics: bool,
     pub(super) timestamp_period: f64,
     pub(super) cache_uuid: [u8; 16],
     pub(super) driver_version: u32,
@@ -230,6 +231,7 @@ impl Instance {
             few_cores: false,
             missing: Vec::new(),
             int64: false,
+            int64_atomics: false,
             timestamp_period: 0.0,
             cache_uuid: first.pipeline_cache_uuid,
             driver_version: first.driver_version,
@@ -288,7 +290,6 @@ impl Instance {
             self.raw
                 .get_physical_device_features2(physical, &mut features)
         };
-        info.int64 = features.features.shader_int64 != 0;
         info.driver = format!(
             "{} {}",
             text(driver.driver_name_as_c_str().map_err(drop)),
@@ -300,6 +301,8 @@ impl Instance {
                 .min(thirteen.max_buffer_size),
             false => eleven.max_memory_allocation_size,
         };
+        info.int64 = features.features.shader_int64 != 0;
+        info.int64_atomics = twelve.shader_buffer_int64_atomics != 0;
         info.subgroup_size = subgroups.subgroup_size;
         info.float_atomics = atomics.shader_buffer_float32_atomic_add != 0;
         // hash_grid_backward_owned counts on eight lanes of one subgroup.

@@ -20,6 +20,8 @@ pub struct KernelModule {
     pub spirv: &'static [u8],
     /// The variant for devices without float atomics or without 64-bit integers, where the kernel uses them.
     pub spirv_of_core: Option<&'static [u8]>,
+    /// The variant whose gradients do not depend on the order in which they are added up, where the kernel handles any.
+    pub deterministic_spirv: Option<&'static [u8]>,
     /// The pointers in the push-constant block.
     pub pointers: &'static [PointerArg],
     /// Whether it reads, or writes, through pointers found elsewhere than in the block.
@@ -173,9 +175,11 @@ impl Pipelines {
         info: &DeviceInfo,
         module: &'static KernelModule,
         constants: &[(u32, u32)],
+        deterministic: bool,
     ) -> Result<vk::Pipeline> {
-        let spirv = match module.spirv_of_core {
-            Some(fallback) if !(info.float_atomics && info.int64) => fallback,
+        let spirv = match (module.deterministic_spirv, module.spirv_of_core) {
+            (Some(ordered), _) if deterministic => ordered,
+            (_, Some(fallback)) if !(info.float_atomics && info.int64) => fallback,
             _ => module.spirv,
         };
         let words: Vec<u32> = bytemuck::pod_collect_to_vec(spirv);
@@ -287,7 +291,9 @@ impl Gpu {
         let (pipeline, row) = match built.get(&key) {
             Some((pipeline, row)) => (*pipeline, row.clone()),
             None => {
-                let pipeline = pipelines.build(&self.inner.context, info, module, &key.1)?;
+                let deterministic = self.deterministic();
+                let pipeline =
+                    pipelines.build(&self.inner.context, info, module, &key.1, deterministic)?;
                 let row: Arc<str> = module.name.into();
                 built.insert(key, (pipeline, row.clone()));
                 (pipeline, row)
@@ -325,7 +331,7 @@ mod tests {
                 ..
             } = &*gpu.inner;
             for module in crate::kernels::ALL {
-                let pipeline = pipelines.build(context, info, module, &[])?;
+                let pipeline = pipelines.build(context, info, module, &[], false)?;
                 // SAFETY: nothing uses it.
                 unsafe { context.device.destroy_pipeline(pipeline, None) };
                 assert_eq!(

@@ -75,7 +75,7 @@ pub struct Module {
 
 /// Functions of glsl/lib/prelude.glsl, as glslang names them, that look at an argument of theirs in another way: the pointers that they make
 /// lead nowhere new.
-const VIEWS: [&str; 4] = ["reading(", "pair_at(", "set_pair(", "add("];
+const VIEWS: [&str; 5] = ["reading(", "floats(", "pair_at(", "set_pair(", "add("];
 const CAPABILITY_INT64: u32 = 11;
 const CAPABILITY_ATOMIC_FLOAT32_ADD: u32 = 6033;
 const DECORATION_SPEC_ID: u32 = 1;

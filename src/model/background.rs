@@ -166,7 +166,7 @@ impl Constant {
         let args = background_constant_backward::Args {
             logits: params.values().ptr().offset(self.logits),
             d_color: b.d_color.ptr(),
-            d_logits: params.grads().ptr_mut().offset(self.logits),
+            d_logits: params.d_value(self.logits),
             n_rays,
         };
         rec.run(&self.backward, Work::items(1), args);
@@ -446,7 +446,7 @@ impl Radiance {
                     .ptr()
                     .offset(u64::from(self.geometry) * u64::from(n)),
                 ray_view: rays.ray_view,
-                d_appearance: params.grads().ptr_mut().offset(self.appearance),
+                d_appearance: params.d_value(self.appearance),
                 n_rays,
                 n_samples,
                 channels: self.appearance_dims,

@@ -585,7 +585,7 @@ impl Field {
             // Nobody reads the last two.
             None => (d_inputs, points, points),
         };
-        let d_table = pass.params.grads().ptr_mut().offset(self.table);
+        let d_table = pass.params.d_value(self.table);
         let levels = self.levels.ptr();
         let slices = self.shape.grid.levels;
         let flops = self.interpolation_flops() / f64::from(slices);

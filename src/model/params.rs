@@ -203,9 +203,11 @@ impl ParamsPlan {
         }
         let row_table = gpu.buffer::<WeightRow>("weight rows", self.rows.len().max(1) as u64)?;
         gpu.upload(&row_table, 0, &self.rows)?;
+        // A sum takes 64 bits where its order must not count (glsl/lib/prelude.glsl).
+        let width = if gpu.deterministic() { 2 } else { 1 };
         let learning = match learns {
             true => Some(Learning {
-                grads: gpu.buffer("gradients", self.len)?,
+                grads: gpu.buffer("gradients", self.len * width)?,
                 first_moment: gpu.buffer("first moments", self.len)?,
                 second_moment: gpu.buffer("second moments", self.len)?,
             }),
@@ -214,7 +216,11 @@ impl ParamsPlan {
         Ok(Params {
             learning,
             effective: gpu.buffer("effective weights", self.effective_len.max(1))?,
-            d_effective: gpu.buffer("effective weight gradients", self.effective_len.max(1))?,
+            d_effective: gpu.buffer(
+                "effective weight gradients",
+                self.effective_len.max(1) * width,
+            )?,
+            width,
             row_table,
             n_rows: self.rows.len() as u64,
             forward: gpu.kernel(weight_norm_forward::Shape::default())?,
@@ -289,7 +295,7 @@ impl Draws {
 
 /// What a block that learns has beside its values.
 struct Learning {
-    grads: Buffer<f32>,         // [len] zero between steps
+    grads: Buffer<f32>,         // [len] sums, zero between steps
     first_moment: Buffer<f32>,  // [len]
     second_moment: Buffer<f32>, // [len]
 }
@@ -300,7 +306,9 @@ pub struct Params {
     values: Buffer<f32>, // [len]
     learning: Option<Learning>,
     effective: Buffer<f32>, // [effective_len] W of every weight-normalised layer
-    d_effective: Buffer<f32>, // [effective_len] zero between steps
+    d_effective: Buffer<f32>, // [effective_len] sums, zero between steps
+    /// Float32 words of a sum.
+    width: u64,
     row_table: Buffer<WeightRow>,
     n_rows: u64,
     forward: Kernel<kernels::weight_norm_forward::Args>,
@@ -326,7 +334,8 @@ impl Params {
         Some(first.first..last.first + last.len())
     }
 
-    /// Values, and where the block learns gradients, first and second moments, each `[len]`.
+    /// Values, and where the block learns gradients, first and second moments, each `[len]`. (On a deterministic device, gradients are not
+    /// floats.)
     pub fn values(&self) -> &Buffer<f32> {
         &self.values
     }
@@ -363,7 +372,7 @@ impl Params {
             rows: self.row_table.ptr(),
             params: self.values.ptr(),
             d_weights: self.d_effective.ptr_mut(),
-            d_params: self.grads().ptr_mut(),
+            d_params: self.d_value(0),
             n: self.n_rows as u32,
             released_columns,
         };
@@ -378,11 +387,16 @@ impl Params {
         }
     }
 
+    /// Where gradients are accumulated from this element of the block on.
+    pub fn d_value(&self, first: u64) -> PtrMut<f32> {
+        self.grads().at_mut(first * self.width)
+    }
+
     /// Where the matrix's gradient is accumulated.
     pub fn d_weight(&self, handle: WeightHandle, offset: u64) -> PtrMut<f32> {
         match handle.weight {
-            WeightAt::Plain(first) => self.grads().ptr_mut().offset(first + offset),
-            WeightAt::Normalised(first) => self.d_effective.ptr_mut().offset(first + offset),
+            WeightAt::Plain(first) => self.d_value(first + offset),
+            WeightAt::Normalised(first) => self.d_effective.at_mut((first + offset) * self.width),
         }
     }
 
@@ -395,8 +409,6 @@ impl Params {
 
     /// Where the bias's gradient is accumulated.
     pub fn d_bias(&self, handle: WeightHandle, offset: u64) -> PtrMut<f32> {
-        self.grads()
-            .ptr_mut()
-            .offset(handle.bias.map_or(0, |first| first + offset))
+        self.d_value(handle.bias.map_or(0, |first| first + offset))
     }
 }

@@ -399,7 +399,7 @@ impl Surface {
         if let Some(scale) = self.global_scale {
             let args = global_scale_backward::Args {
                 d_scale: self.d_scale(b),
-                d_parameter: params.grads().ptr_mut().offset(scale),
+                d_parameter: params.d_value(scale),
                 n,
             };
             let work = Work::items(1).bytes(8.0 * f64::from(n));
@@ -450,7 +450,7 @@ impl Surface {
                     .ptr()
                     .offset(u64::from(1 + self.geometry + 3) * u64::from(n)),
                 ray_view: inputs.ray_view,
-                d_appearance: params.grads().ptr_mut().offset(self.appearance),
+                d_appearance: params.d_value(self.appearance),
                 n_rays: inputs.n_rays,
                 n_samples: n / inputs.n_rays,
                 channels: self.appearance_dims,

@@ -53,7 +53,7 @@ impl Adam {
             let n = range.end - range.start;
             let args = adam::Args {
                 params: params.values().at_mut(range.start),
-                grads: params.grads().at_mut(range.start),
+                grads: params.d_value(range.start),
                 first_moment: params.first_moment().at_mut(range.start),
                 second_moment: params.second_moment().at_mut(range.start),
                 bad_step: bad_step.ptr(),

@@ -110,7 +110,9 @@ impl Trainer {
                     Err(error) => return Err(error),
                 }
             }
-            let overdue = report.checkpoint_minutes > 0.0
+            // (A checkpoint brings a lazy table up to date, which shows in the last digits of what follows.)
+            let overdue = !self.config.deterministic
+                && report.checkpoint_minutes > 0.0
                 && saved.1.elapsed().as_secs_f64() >= 60.0 * report.checkpoint_minutes;
             if stopping || last || overdue || due(step, report.checkpoint_steps, false) {
                 if let Some(losses) = self.finish()? {

@@ -82,8 +82,6 @@ fn methods_are_compared_and_a_study_goes_on() {
     let path = |name: &str| folder.path().join(name).to_str().unwrap().to_string();
     let (photos, study, points) = (path("photos"), path("study"), path("points.ply"));
     write_dataset(Path::new(&photos));
-    // After eight steps the surface still is the ball of radius 0.45 that it began as.
-    write_ball(Path::new(&points));
     let compare = |methods: &str| {
         let words = [
             &["compare", &photos, "--out", &study, "--methods", methods][..],
@@ -98,7 +96,17 @@ fn methods_are_compared_and_a_study_goes_on() {
     let unknown = compare("neurodin,neus");
     assert_eq!(unknown.code, Some(3), "{}", unknown.stderr);
     assert!(unknown.stderr.contains("'neus-grid'"), "{}", unknown.stderr);
+    let no_reference = compare("neuralangelo");
+    assert_eq!(no_reference.code, Some(3), "{}", no_reference.stderr);
+    assert!(
+        no_reference.stderr.contains("points.ply"),
+        "{}",
+        no_reference.stderr
+    );
+    assert!(!Path::new(&study).exists(), "nothing was trained");
 
+    // After eight steps the surface still is the ball of radius 0.45 that it began as.
+    write_ball(Path::new(&points));
     let first = compare("neuralangelo");
     assert_eq!(first.code, Some(0), "{}", first.stderr);
     let both = compare("neurodin,neuralangelo");
