@@ -22,24 +22,20 @@ layout(push_constant, scalar) uniform Args {
     uint n;
 };
 
-// The last tile may overhang: it recomputes the last channel there and stores nothing. (lavapipe keeps a mask for every condition that it
-// cannot decide beforehand.)
-const bool OVERHANGS = OUTPUTS % TILE != 0u;
-uint channel(uint first, uint t) { return OVERHANGS ? min(first + t, OUTPUTS - 1u) : first + t; }
-
 uint weight_index(uint o, uint i) { return TRANSPOSED != 0u ? i * WEIGHT_COLUMNS + o : o * WEIGHT_COLUMNS + i; }
 
 void main() {
     uint sample_ = item();
     if (sample_ >= n) return;
     uint first = slice() * TILE;
+    // The last tile may overhang: it recomputes the last channel there and stores nothing.
     float sum[TILE];
-    [[unroll]] for (uint t = 0u; t < TILE; ++t) sum[t] = BIAS != 0u ? bias.at[channel(first, t)] : 0.0;
+    [[unroll]] for (uint t = 0u; t < TILE; ++t) sum[t] = BIAS != 0u ? bias.at[min(first + t, OUTPUTS - 1u)] : 0.0;
     if (INPUTS <= 64u) {
         [[unroll]] for (uint i = 0u; i < min(INPUTS, 64u); ++i) {
             float value = x.at[i * n + sample_];
             [[unroll]] for (uint t = 0u; t < TILE; ++t)
-                sum[t] = fma(weight.at[weight_index(channel(first, t), i)], value, sum[t]);
+                sum[t] = fma(weight.at[weight_index(min(first + t, OUTPUTS - 1u), i)], value, sum[t]);
         }
     } else {
         for (uint i0 = 0u; i0 < INPUTS; i0 += CHUNK) {
@@ -47,12 +43,12 @@ void main() {
                 uint i = min(i0 + c, INPUTS - 1u);
                 float value = i0 + c < INPUTS ? x.at[i * n + sample_] : 0.0;
                 [[unroll]] for (uint t = 0u; t < TILE; ++t)
-                    sum[t] = fma(weight.at[weight_index(channel(first, t), i)], value, sum[t]);
+                    sum[t] = fma(weight.at[weight_index(min(first + t, OUTPUTS - 1u), i)], value, sum[t]);
             }
         }
     }
     [[unroll]] for (uint t = 0u; t < TILE; ++t) {
-        if (!OVERHANGS || first + t < OUTPUTS) {
+        if (first + t < OUTPUTS) {
             float value = sum[t];
             if (ACTIVATION == 1u) value = max(value, 0.0);
             if (ACTIVATION == 2u) value = 1.0 / (1.0 + exp(-value));
