@@ -25,8 +25,8 @@ const RECIPE: &str = "vulkan 1.2, spir-v 1.5, unoptimised, 1";
 const CORE_ONLY: &str = "CORE_ONLY";
 /// Defined for the third variant of a kernel that handles gradients: their sums do not depend on the order.
 const DETERMINISTIC: &str = "DETERMINISTIC";
-/// The pointer type of gradients (lib/prelude.glsl).
-const SUMS: &str = "SumsMut";
+/// The pointer type of gradients (lib/sums.glsl).
+const SUMS: &str = "SumsMut ";
 /// Every implementation has this much, and lavapipe of 2022 no more.
 const PUSH_CONSTANT_BYTES: u32 = 128;
 
@@ -118,7 +118,7 @@ fn kernel(
             ));
         }
     }
-    if source.names(SUMS) {
+    if source.takes(SUMS) {
         compiled(&source, stem, DETERMINISTIC, out)?;
     }
     for (name, layout) in &module.structs {
@@ -161,10 +161,10 @@ impl Source {
         Ok(source)
     }
 
-    /// Whether the kernel's own text does, beyond the prelude that all have.
-    fn names(&self, word: &str) -> bool {
-        let mut lines = self.text.lines().zip(&self.lines);
-        lines.any(|(line, (file, _))| file != "lib/prelude.glsl" && line.contains(word))
+    /// Whether an argument of the kernel is of this type.
+    fn takes(&self, ty: &str) -> bool {
+        let mut lines = self.text.lines();
+        lines.any(|line| line.trim_start().starts_with(ty))
     }
 
     /// Appends a file; names in `#include "..."` are looked for beside the file, then under glsl/. Each file enters once.
@@ -378,7 +378,7 @@ fn rust_module(stem: &str, source: &Source, module: &Module) -> Result<String, S
         true => format!("Some({})", embed(CORE_ONLY)),
         false => "None".into(),
     };
-    let deterministic = match source.names(SUMS) {
+    let deterministic = match source.takes(SUMS) {
         true => format!("Some({})", embed(DETERMINISTIC)),
         false => "None".into(),
     };

@@ -1,6 +1,7 @@
 #version 460
 // Gradient of a ray's appearance code: the sum over the ray's samples, one (ray, channel) per invocation.
 #include "lib/prelude.glsl"
+#include "lib/sums.glsl"
 
 layout(push_constant, scalar) uniform Args {
     F32s d_code;         // [channels, n_rays * n_samples]

@@ -1,6 +1,7 @@
 #version 460
 // Gradient of the learned background colour: the sum over all rays through the sigmoid, added up by one workgroup in a fixed order.
 #include "lib/prelude.glsl"
+#include "lib/sums.glsl"
 
 layout(push_constant, scalar) uniform Args {
     F32s logits;       // [3]

@@ -6,6 +6,7 @@
 // u is computed again from z: reading it back would cost more than the sum. d_e, the hash features' part of d_z, goes to
 // hash_grid_backward; the coordinates' part is wanted with SECOND_ORDER only.
 #include "lib/prelude.glsl"
+#include "lib/sums.glsl"
 #include "lib/field.glsl"
 
 layout(constant_id = 7) const uint HEADS = 1;  // as in field_forward

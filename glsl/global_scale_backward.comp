@@ -3,6 +3,7 @@
 // The gradient of the one scale that all samples share: the sum of its summands, which leave zeros behind, since they stand where the
 // network's own logit would have its gradient. One workgroup, fixed order.
 #include "lib/prelude.glsl"
+#include "lib/sums.glsl"
 
 layout(push_constant, scalar) uniform Args {
     F32sMut d_scale;     // [n] consumed

@@ -1,5 +1,6 @@
 #version 460
 #include "lib/prelude.glsl"
+#include "lib/sums.glsl"
 // Adds to entries of eight floats at random in a table, 16 per invocation, by atomics: the fastest that a hash grid's gradient can be
 // scattered without aggregating it first. Measures the roof for tables of one size.
 layout(push_constant, scalar) uniform Args {

@@ -3,6 +3,7 @@
 // An invocation has one output and TILE inputs, sums `chunk` samples in registers and touches memory once per entry. All lanes ask for
 // the same x, so that it costs one load for all of them. Slices are blocks of outputs × tiles of inputs; workgroups along x are chunks.
 #include "lib/prelude.glsl"
+#include "lib/sums.glsl"
 
 layout(constant_id = 0) const uint INPUTS = 64;
 layout(constant_id = 1) const uint OUTPUTS = 64;

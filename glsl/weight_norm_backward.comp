@@ -2,6 +2,7 @@
 // Adjoint of weight_norm_forward, one row per invocation: with s = d_W·v/‖v‖,
 //   d_g += s,  d_v += g/‖v‖ (d_W − s v/‖v‖).  d_W is consumed: zeroed for the next step.
 #include "lib/prelude.glsl"
+#include "lib/sums.glsl"
 #include "lib/weight_rows.glsl"
 
 layout(push_constant, scalar) uniform Args {

@@ -1,4 +1,5 @@
 // One step of AdamW with decoupled decay (Loshchilov & Hutter 2019, algorithm 2; Adam where λ is 0), of a parameter and its moments.
+#include "lib/sums.glsl"
 
 struct Moving {
     float p;

@@ -1,5 +1,7 @@
 // An entry of a hash table: FEATURES numbers side by side (the including kernel's constant), read and written in pairs; a single feature
 // has 0 beside it.
+#include "lib/sums.glsl"
+
 const uint PAIRS = (FEATURES + 1u) / 2u;
 
 vec2 load_features(F32s table, uint entry, uint pair) {

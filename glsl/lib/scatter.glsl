@@ -1,4 +1,5 @@
 // What the scatters of gradients into the hash table share: their arguments, and what a point adds to a corner.
+#include "lib/sums.glsl"
 
 layout(constant_id = 0) const uint LEVELS = 12;
 layout(constant_id = 1) const uint FEATURES = 2;

@@ -73,7 +73,7 @@ pub struct Module {
     pub indirect_writes: bool,
 }
 
-/// Functions of glsl/lib/prelude.glsl, as glslang names them, that look at an argument of theirs in another way: the pointers that they make
+/// Functions of glsl/lib/prelude.glsl and sums.glsl, as glslang names them, that look at an argument of theirs in another way: the pointers that they make
 /// lead nowhere new.
 const VIEWS: [&str; 5] = ["reading(", "floats(", "pair_at(", "set_pair(", "add("];
 const CAPABILITY_INT64: u32 = 11;

@@ -203,7 +203,7 @@ impl ParamsPlan {
         }
         let row_table = gpu.buffer::<WeightRow>("weight rows", self.rows.len().max(1) as u64)?;
         gpu.upload(&row_table, 0, &self.rows)?;
-        // A sum takes 64 bits where its order must not count (glsl/lib/prelude.glsl).
+        // A sum takes 64 bits where its order must not count (glsl/lib/sums.glsl).
         let width = if gpu.deterministic() { 2 } else { 1 };
         let learning = match learns {
             true => Some(Learning {
