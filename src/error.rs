@@ -62,6 +62,12 @@ impl Error {
         }
     }
 
+    /// An input file that cannot be read.
+    pub fn unreadable(path: impl AsRef<Path>, error: &std::io::Error) -> Self {
+        let next = "name a file that is there and may be read";
+        Error::input(path, format!("cannot be read: {error}"), next)
+    }
+
     /// An output that cannot be made, with what to do about it.
     pub fn output(
         path: impl AsRef<Path>,

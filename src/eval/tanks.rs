@@ -71,7 +71,8 @@ impl Prism {
             let next = "give the scene's crop file, a SelectionPolygonVolume as Open3D saves it";
             Error::input(file, what, next)
         };
-        let text = std::fs::read_to_string(file).map_err(|error| Error::io(file, error))?;
+        let text =
+            std::fs::read_to_string(file).map_err(|error| Error::unreadable(file, &error))?;
         let volume: SelectionPolygonVolume = serde_json::from_str(&text)
             .map_err(|error| wrong(format!("is no crop file: {error}")))?;
         let axis = match volume.orthogonal_axis.to_ascii_uppercase().as_str() {

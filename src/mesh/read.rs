@@ -12,7 +12,7 @@ use crate::{Error, Result};
 /// them.
 ///
 /// # Errors
-/// `Input` for an unknown extension or a damaged file, with the place; `Io` if it cannot be read.
+/// `Input` for a file that cannot be read, an unknown extension, or a damaged file, with the place.
 pub fn read_mesh(path: &Path) -> Result<Mesh> {
     let extension = path
         .extension()
@@ -31,7 +31,7 @@ pub fn read_mesh(path: &Path) -> Result<Mesh> {
             ));
         }
     };
-    let bytes = std::fs::read(path).map_err(|source| Error::io(path, source))?;
+    let bytes = std::fs::read(path).map_err(|error| Error::unreadable(path, &error))?;
     parse(&bytes).map_err(|what| {
         Error::input(
             path,

@@ -113,7 +113,8 @@ fn read_similarity(file: &Path) -> Result<DMat4> {
         }
         Some("npy") => crate::arrays::Arrays::open(file)?.matrix("the array")?,
         _ => {
-            let text = std::fs::read_to_string(file).map_err(|error| Error::io(file, error))?;
+            let text =
+                std::fs::read_to_string(file).map_err(|error| Error::unreadable(file, &error))?;
             let words: Vec<&str> = text
                 .split(|c: char| c.is_whitespace() || c == ',')
                 .filter(|word| !word.is_empty())
