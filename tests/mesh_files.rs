@@ -398,7 +398,7 @@ fn damaged_files_are_refused() {
     assert!(matches!(parse("a.stl", b"solid"), Err(Error::Input { .. })));
     assert!(matches!(
         read_mesh(Path::new("/nonexistent/mesh.ply")),
-        Err(Error::Io { .. })
+        Err(Error::Input { .. })
     ));
 }
 
