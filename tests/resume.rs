@@ -115,6 +115,8 @@ fn deterministic_runs_are_the_same_to_the_bit() {
     let two = one.second_stage().unwrap();
     for (stage, config) in [("1", one), ("2", two)] {
         let trained = |gpu: &Gpu, name: &str, from: Option<&Checkpoint>, steps: u64| {
+            let mut config = config.clone();
+            config.deterministic = gpu.deterministic();
             let mut trainer = Trainer::new(gpu, &scene, &region, &config).unwrap();
             if let Some(from) = from {
                 trainer.restore(from).unwrap();
@@ -154,6 +156,15 @@ fn deterministic_runs_are_the_same_to_the_bit() {
             "stage {stage}: {error:e} of {norm:e}"
         );
     }
+    let mut unlike = of_every_kind();
+    unlike.deterministic = true;
+    let refused = Trainer::new(&floating, &scene, &region, &unlike)
+        .err()
+        .unwrap();
+    assert!(
+        refused.to_string().contains("deterministic = true"),
+        "{refused}"
+    );
     for gpu in [fixed, floating] {
         gpu.check_guards().unwrap();
         assert_eq!(gpu.validation_messages(), Vec::<String>::new());

@@ -27,7 +27,7 @@ pub(super) struct SettingsArgs {
     /// Seed of every random number
     #[arg(long, value_name = "N", env = "NEURODIN_SEED")]
     pub seed: Option<u32>,
-    /// The same run comes out in the same bits, on one device (what it costs: tools/runs/throughput.md)
+    /// The same run comes out in the same bits, on one device; steps take a tenth longer or so, gradients twice the memory
     #[arg(long)]
     pub deterministic: bool,
     /// One setting, for example hash.log2_size=22; may be given several times

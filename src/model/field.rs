@@ -90,13 +90,13 @@ struct Network<A> {
 }
 
 impl<A> Network<A> {
-    /// What to launch for these points, of which those before `n_hidden` have heads.
-    fn launches(&self, points: Range<u32>, n_hidden: u32) -> Vec<(&Kernel<A>, Range<u32>)> {
-        let Some(headless) = &self.headless else {
-            return vec![(&self.kernel, points)];
+    /// What to launch for these points, of which those before `n_hidden` have heads; one of the two may be for none.
+    fn launches(&self, points: Range<u32>, n_hidden: u32) -> [(&Kernel<A>, Range<u32>); 2] {
+        let (headless, border) = match &self.headless {
+            Some(headless) => (headless, n_hidden.clamp(points.start, points.end)),
+            None => (&self.kernel, points.end),
         };
-        let border = n_hidden.clamp(points.start, points.end);
-        vec![
+        [
             (&self.kernel, points.start..border),
             (headless, border..points.end),
         ]
@@ -469,7 +469,7 @@ impl Field {
 
     /// Adds all parameter gradients, from `d_first [n]`, for the leading points the heads' gradients in `buffers.hidden`, and for a field
     /// with a gradient `d_gradient` of its buffers. What such a field's points hear goes into `d_points [3, n]` where that is asked for.
-    #[allow(clippy::too_many_arguments)]
+    #[allow(clippy::too_many_arguments)] // what a pass over the points needs; a struct would only rename them
     pub fn backward(
         &self,
         rec: &mut Recorder,

@@ -10,7 +10,6 @@ pub mod trained;
 
 use glam::DMat4;
 
-use crate::Result;
 use crate::config::{AppearanceAtEval, Config, MaskUse};
 use crate::gpu::{Gpu, Readback, Recorder, Ticket};
 use crate::model::{Background, Model, Proposal, Scratch, Surface, TapStep};
@@ -18,6 +17,7 @@ use crate::render::{
     Annealed, Loss, LossScales, Priors, Rendered, Renderer, Shot, TERMS, TRAINING, ViewTable,
 };
 use crate::scene::{Camera, ObjectMasks, Region, Scene, Split};
+use crate::{Error, Result};
 use adam::Adam;
 use schedule::{Now, Schedule};
 
@@ -59,8 +59,18 @@ impl Trainer {
     /// Builds the model, uploads the training pictures and allocates everything that a step needs.
     ///
     /// # Errors
-    /// What reading a picture, a mask or a prior or allocating device memory fails with.
+    /// What reading a picture, a mask or a prior or allocating device memory fails with; `Config` where the device was not opened as the
+    /// configuration wants it.
     pub fn new(gpu: &Gpu, scene: &Scene, region: &Region, config: &Config) -> Result<Trainer> {
+        if config.deterministic != gpu.deterministic() {
+            return Err(Error::Config {
+                what: format!(
+                    "deterministic = {}, but the device was opened with GpuOptions::deterministic = {}",
+                    config.deterministic,
+                    gpu.deterministic()
+                ),
+            });
+        }
         let training: Vec<usize> = scene.split(Split::Train).collect();
         let held_out: Vec<usize> = scene.split(Split::Test).collect();
         let preview = run::PreviewView::choose(scene, config);

@@ -65,6 +65,17 @@ fn second_stage_indoors_with_other_features() -> Result<()> {
     check(config, RegionShape::Box { half }, 9, false)
 }
 
+/// A single feature stands alone where all others stand in pairs.
+#[test]
+fn both_stages_with_one_feature() -> Result<()> {
+    for mut config in [preset("outdoor-tiny"), second("outdoor-tiny")] {
+        config.hash.features = 1;
+        config.rays = 100; // among fewer there is no bias to correct
+        check(config, RegionShape::Sphere, 9, false)?;
+    }
+    Ok(())
+}
+
 /// Every density, scale and kind of gradient that the methods combine.
 #[test]
 fn laplace_density_of_one_beta_with_analytic_gradient() -> Result<()> {
