@@ -25,6 +25,10 @@ const RECIPE: &str = "vulkan 1.2, spir-v 1.5, unoptimised, 1";
 const CORE_ONLY: &str = "CORE_ONLY";
 /// Defined for the third variant of a kernel that handles gradients: their sums do not depend on the order.
 const DETERMINISTIC: &str = "DETERMINISTIC";
+/// What the file of a kernel's second form has in its name: the same by cooperative matrices, `<stem>.cooperative.comp`.
+const COOPERATIVE: &str = "cooperative";
+/// Specialisation constants from here on are what cooperative matrices are made of; the device says it (lib/cooperative.glsl).
+const MATRIX_CONSTANTS: u32 = 100;
 /// The pointer type of gradients (lib/sums.glsl).
 const SUMS: &str = "SumsMut ";
 /// Every implementation has this much, and lavapipe of 2022 no more.
@@ -48,14 +52,28 @@ fn main() {
         })
         .collect();
     paths.sort();
+    let forms: Vec<PathBuf> = paths
+        .extract_if(.., |path| stem_of(path).contains('.'))
+        .collect();
 
     let mut text = String::new();
     let mut structs: BTreeMap<String, (String, Struct)> = BTreeMap::new();
     let mut errors = Vec::new();
     for path in &paths {
-        match kernel(&glsl, path, &out, &mut structs) {
+        let second = format!("{}.{COOPERATIVE}", stem_of(path));
+        let second = forms.iter().find(|form| stem_of(form) == second);
+        match kernel(&glsl, path, second, &out, &mut structs) {
             Ok(module) => text.push_str(&module),
             Err(error) => errors.push(error),
+        }
+    }
+    for form in &forms {
+        let of = stem_of(form).strip_suffix(&format!(".{COOPERATIVE}"));
+        if !of.is_some_and(|of| paths.iter().any(|path| stem_of(path) == of)) {
+            errors.push(format!(
+                "{}: no kernel that this could be a form of; <kernel>.{COOPERATIVE}.comp expected",
+                form.display()
+            ));
         }
     }
     for (name, (kernel, layout)) in &structs {
@@ -70,7 +88,7 @@ fn main() {
         }
         std::process::exit(1);
     }
-    let stems = paths.iter().filter_map(|path| path.file_stem()?.to_str());
+    let stems = paths.iter().map(|path| stem_of(path));
     let modules: String = stems.map(|stem| format!("&{stem}::MODULE, ")).collect();
     let _ = writeln!(
         text,
@@ -94,17 +112,62 @@ fn name_commit() {
     }
 }
 
-/// Compiles one kernel, or takes what an earlier build made of the same text, and returns its module's Rust text.
+/// A kernel's name: its file's.
+fn stem_of(path: &Path) -> &str {
+    path.file_stem()
+        .and_then(|stem| stem.to_str())
+        .expect("kernel files have plain names")
+}
+
+/// Compiles one kernel with all its variants, or takes what an earlier build made of the same text, and returns its module's Rust text.
 fn kernel(
     glsl: &Path,
     path: &Path,
+    cooperative: Option<&PathBuf>,
     out: &Path,
     structs: &mut BTreeMap<String, (String, Struct)>,
 ) -> Result<String, String> {
-    let stem = path
-        .file_stem()
-        .and_then(|stem| stem.to_str())
-        .expect("kernel files have plain names");
+    let stem = stem_of(path);
+    let (source, module) = form(glsl, path, out)?;
+    if module.cooperative {
+        return Err(format!(
+            "glsl/{stem}.comp: cooperative matrices belong into glsl/{stem}.{COOPERATIVE}.comp, beside what runs everywhere"
+        ));
+    }
+    let second = match cooperative {
+        None => None,
+        Some(path) => {
+            let (source, second) = form(glsl, path, out)?;
+            let foreign = second.constants.iter().find(|constant| {
+                constant.id < MATRIX_CONSTANTS && !module.constants.contains(constant)
+            });
+            if second.args != module.args || foreign.is_some() {
+                return Err(format!(
+                    "glsl/{stem}.{COOPERATIVE}.comp: Args and constants must be those of glsl/{stem}.comp{}",
+                    foreign.map_or(String::new(), |c| format!(" ({} is not)", c.name))
+                ));
+            }
+            Some(kernel_module(stem_of(path), &source, &second, "None"))
+        }
+    };
+    for (name, layout) in &module.structs {
+        match structs.get(name) {
+            Some((other, known)) if known.fields != layout.fields => {
+                return Err(format!(
+                    "glsl/{stem}.comp and glsl/{other}.comp declare struct {name} differently"
+                ));
+            }
+            Some((_, known)) if known.stride.is_some() => {}
+            _ => drop(structs.insert(name.clone(), (stem.to_string(), layout.clone()))),
+        }
+    }
+    rust_module(stem, &source, &module, second)
+        .map_err(|error| format!("glsl/{stem}.comp: {error}"))
+}
+
+/// One file of a kernel: compiled with its variants, and reflected.
+fn form(glsl: &Path, path: &Path, out: &Path) -> Result<(Source, Module), String> {
+    let stem = stem_of(path);
     let source = Source::flatten(glsl, path)?;
     let spirv = compiled(&source, stem, "", out)?;
     let module = Module::read(&spirv).map_err(|error| format!("glsl/{stem}.comp: {error}"))?;
@@ -121,18 +184,7 @@ fn kernel(
     if source.takes(SUMS) {
         compiled(&source, stem, DETERMINISTIC, out)?;
     }
-    for (name, layout) in &module.structs {
-        match structs.get(name) {
-            Some((other, known)) if known.fields != layout.fields => {
-                return Err(format!(
-                    "glsl/{stem}.comp and glsl/{other}.comp declare struct {name} differently"
-                ));
-            }
-            Some((_, known)) if known.stride.is_some() => {}
-            _ => drop(structs.insert(name.clone(), (stem.to_string(), layout.clone()))),
-        }
-    }
-    rust_module(stem, &source, &module).map_err(|error| format!("glsl/{stem}.comp: {error}"))
+    Ok((source, module))
 }
 
 /// A kernel's text with its includes in place, and where each line came from.
@@ -294,8 +346,14 @@ fn write_if_changed(path: &Path, bytes: &[u8]) {
     }
 }
 
-/// `kernels::<stem>`: the block's twin, the constants, the tables that the recorder and the pipelines need.
-fn rust_module(stem: &str, source: &Source, module: &Module) -> Result<String, String> {
+/// `kernels::<stem>`: the block's twin, the constants, the tables that the recorder and the pipelines need; `second` is the kernel's
+/// form by cooperative matrices.
+fn rust_module(
+    stem: &str,
+    source: &Source,
+    module: &Module,
+    second: Option<String>,
+) -> Result<String, String> {
     let mut text = String::new();
     let w = &mut text;
     let about = source
@@ -368,6 +426,24 @@ fn rust_module(stem: &str, source: &Source, module: &Module) -> Result<String, S
         "fn constants(&self) -> Vec<(u32, u32)> {{ let constants: [(u32, u32); {count}] = [{bits}]; constants.to_vec() }}\n}}"
     );
 
+    let cooperative = match second {
+        None => "None".into(),
+        Some(second) => {
+            let ty = "crate::gpu::KernelModule";
+            let _ = writeln!(w, "static COOPERATIVE: {ty} = {second};");
+            "Some(&COOPERATIVE)".to_string()
+        }
+    };
+    let _ = writeln!(
+        w,
+        "pub(super) static MODULE: crate::gpu::KernelModule = {};\n}}",
+        kernel_module(stem, source, module, &cooperative)
+    );
+    Ok(text)
+}
+
+/// The `KernelModule` of one file of a kernel.
+fn kernel_module(stem: &str, source: &Source, module: &Module, cooperative: &str) -> String {
     let embed = |define| {
         format!(
             "include_bytes!(concat!(env!(\"OUT_DIR\"), \"/{}\"))",
@@ -392,16 +468,15 @@ fn rust_module(stem: &str, source: &Source, module: &Module) -> Result<String, S
             );
         }
     }
-    let _ = writeln!(
-        w,
-        "pub(super) static MODULE: crate::gpu::KernelModule = crate::gpu::KernelModule {{ name: {stem:?}, local_size: {:?}, spirv: {}, \
-         spirv_of_core: {fallback}, deterministic_spirv: {deterministic}, pointers: &[{pointers}], indirect_reads: {}, indirect_writes: {} }};\n}}",
+    format!(
+        "crate::gpu::KernelModule {{ name: {stem:?}, local_size: {:?}, spirv: {}, spirv_of_core: {fallback}, \
+         deterministic_spirv: {deterministic}, cooperative: {cooperative}, pointers: &[{pointers}], indirect_reads: {}, \
+         indirect_writes: {} }}",
         module.local_size,
         embed(""),
         module.indirect_reads,
         module.indirect_writes
-    );
-    Ok(text)
+    )
 }
 
 /// `kernels::<Name>`: a structure that lies behind pointers.

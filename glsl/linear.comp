@@ -12,6 +12,7 @@ layout(constant_id = 5) const uint ACTIVATION = 0;       // 0 none, 1 ReLU, 2 si
 layout(constant_id = 6) const uint GATED = 0;            // multiply by 1[gate > 0]
 layout(constant_id = 7) const uint TILE = 16;
 const uint CHUNK = 8;                                    // inputs per turn of the rolled loop for wide layers
+#include "lib/linear.glsl"
 
 layout(push_constant, scalar) uniform Args {
     F32s x;         // [INPUTS, n]
@@ -21,8 +22,6 @@ layout(push_constant, scalar) uniform Args {
     F32sMut y;      // [OUTPUTS, n]
     uint n;
 };
-
-uint weight_index(uint o, uint i) { return TRANSPOSED != 0u ? i * WEIGHT_COLUMNS + o : o * WEIGHT_COLUMNS + i; }
 
 void main() {
     uint sample_ = item();
@@ -49,9 +48,7 @@ void main() {
     }
     [[unroll]] for (uint t = 0u; t < TILE; ++t) {
         if (first + t < OUTPUTS) {
-            float value = sum[t];
-            if (ACTIVATION == 1u) value = max(value, 0.0);
-            if (ACTIVATION == 2u) value = 1.0 / (1.0 + exp(-value));
+            float value = activated(sum[t]);
             uint at = (first + t) * n + sample_;
             if (GATED != 0u && !(gate.at[at] > 0.0)) value = 0.0;
             y.at[at] = value;

@@ -4,6 +4,7 @@
 //! default; the other presets are lists of differences from it. A `Config` is never written to after construction: what changes with
 //! time is computed by [`crate::train::schedule`] from the step.
 
+use crate::gpu::Matrices;
 use serde::{Deserialize, Serialize};
 
 mod difference;
@@ -25,6 +26,8 @@ pub struct Config {
     pub seed: u32,
     /// The same run comes out in the same bits, on one device: gradients add up in fixed point, and no clock decides what is computed.
     pub deterministic: bool,
+    /// How wide layers are multiplied.
+    pub matrices: Matrices,
     /// Length of the stage. The schedules below are written for `schedule_steps` and stretched to this.
     pub steps: u64,
     /// Steps of the stage before it: the number that its own first step has.

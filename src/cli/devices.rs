@@ -50,6 +50,7 @@ pub(super) fn run(_: &DevicesArgs, context: &Context) -> anyhow::Result<()> {
                 "shared_memory": device.shared_memory,
                 "max_workgroup": device.max_workgroup,
                 "float_atomics": device.float_atomics,
+                "matrix": device.matrix,
                 "usable": device.missing.is_empty(),
                 "missing": device.missing,
             })

@@ -25,6 +25,7 @@ use clap::{
 };
 use std::io::IsTerminal;
 use std::panic::AssertUnwindSafe;
+use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::LazyLock;
 
@@ -77,6 +78,12 @@ struct Global {
     /// Vulkan device: its number in `neurodin devices`, or part of its name
     #[arg(long, global = true, value_name = "DEVICE", env = "NEURODIN_DEVICE")]
     device: Option<String>,
+    /// Folder for compiled kernels and for what was measured of the device [default: neurodin in the user's cache folder]
+    #[arg(long, global = true, value_name = "DIR", env = "NEURODIN_CACHE")]
+    cache: Option<PathBuf>,
+    /// Do not measure at the first start on a device which shapes of kernels are fastest there
+    #[arg(long, global = true)]
+    no_autotune: bool,
     /// Results as JSON on stdout
     #[arg(long, global = true)]
     json: bool,

@@ -7,6 +7,7 @@ use crate::{Error, Result};
 use indicatif::ProgressBar;
 use serde_json::{Map, Value, json};
 use std::io::{IsTerminal, Write};
+use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::Mutex;
 use std::time::SystemTime;
@@ -15,6 +16,8 @@ use std::time::SystemTime;
 #[derive(Clone, Debug)]
 pub struct Context {
     device: Option<String>,
+    cache: Option<PathBuf>,
+    autotune: bool,
     validation: bool,
     json: bool,
     quiet: bool,
@@ -26,6 +29,8 @@ impl Context {
     pub(super) fn new(global: &Global, colored: bool) -> Context {
         Context {
             device: global.device.clone(),
+            cache: global.cache.clone().or_else(users_cache),
+            autotune: !global.no_autotune,
             validation: global.validation,
             json: global.json,
             quiet: global.quiet,
@@ -50,6 +55,8 @@ impl Context {
         let gpu = Gpu::new(&GpuOptions {
             device: self.device.clone(),
             validation: self.validation || options.validation,
+            cache_dir: self.cache.clone(),
+            autotune: self.autotune,
             ..options
         })?;
         super::diagnostics::note_device(&gpu.info().name);
@@ -202,6 +209,14 @@ pub(super) fn line(text: &str) {
         Ok(Some(bar)) => bar.suspend(write),
         _ => write(),
     }
+}
+
+/// Where the XDG base directory specification puts what a program can make again; `None` where the user has no home.
+fn users_cache() -> Option<PathBuf> {
+    let folder = |name| std::env::var_os(name).map(PathBuf::from);
+    let absolute = folder("XDG_CACHE_HOME").filter(|path| path.is_absolute());
+    let caches = absolute.or_else(|| Some(folder("HOME")?.join(".cache")))?;
+    Some(caches.join("neurodin"))
 }
 
 #[cfg(test)]

@@ -290,6 +290,7 @@ fn in_words(region: &Region) -> String {
 pub(super) fn gpu_options(config: &Config) -> GpuOptions {
     GpuOptions {
         deterministic: config.deterministic,
+        matrices: config.matrices,
         ..GpuOptions::default()
     }
 }

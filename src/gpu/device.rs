@@ -5,9 +5,11 @@ use super::kernel::Pipelines;
 use super::memory::Memory;
 use super::profile::Profiler;
 use super::queue::Queue;
+use super::tuning::{self, Tuning};
 use super::validation::ValidationLog;
 use crate::{Error, Result};
 use ash::{ext, khr, vk};
+use serde::{Deserialize, Serialize};
 use std::ffi::CStr;
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -30,11 +32,38 @@ pub struct GpuOptions {
     /// Adds gradients up so that their order does not count: the same run comes out in the same bits, on one device. Needs 64-bit
     /// atomics, which `portable` leaves alone.
     pub deterministic: bool,
+    /// How wide layers are multiplied.
+    pub matrices: Matrices,
+    /// Measures which shapes of kernels are fastest here, at the first start, and remembers it in the cache folder. Without it, and with
+    /// `deterministic`, everything has its usual shape.
+    pub autotune: bool,
     /// Bytes of device memory that buffers may take; `None`: what the device has.
     pub memory_limit: Option<u64>,
     /// Folder that keeps compiled pipelines from one run to the next; `None` keeps none. (Software drivers have their own cache and
     /// ignore this one.)
     pub cache_dir: Option<PathBuf>,
+}
+
+/// Whether products of matrices go to the device's units for them (VK_KHR_cooperative_matrix), and how exactly. Operands are float16
+/// there, each chunk of them scaled to fit; sums are float32.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Matrices {
+    /// Compensated where that has been measured to be faster ([`GpuOptions::autotune`]), otherwise off.
+    #[default]
+    Auto,
+    Off,
+    /// Each operand in two float16s: three products, as exact as float32.
+    Compensated,
+    /// Operands rounded to float16.
+    Float16,
+}
+
+impl Matrices {
+    /// Whether nothing else will do.
+    pub fn is_demanded(self) -> bool {
+        matches!(self, Matrices::Compensated | Matrices::Float16)
+    }
 }
 
 /// A Vulkan device, ready to work. Cheap to clone; all clones are the same device.
@@ -49,6 +78,7 @@ pub(super) struct Inner {
     pub(super) pipelines: Pipelines,
     pub(super) memory: Memory,
     pub(super) profiler: Profiler,
+    pub(super) tuning: Tuning,
     pub(super) info: DeviceInfo,
     pub(super) options: GpuOptions,
     pub(super) context: Context,
@@ -91,6 +121,16 @@ impl Gpu {
             info.int64 = false;
             info.few_cores = false;
             info.full_subgroups = None;
+            info.matrix = None;
+        }
+        if info.matrix.is_none() && options.matrices.is_demanded() {
+            return Err(Error::NoDevice {
+                what: format!(
+                    "{} has no cooperative matrices of float16 with float32 sums, which matrices = \"compensated\" and \"float16\" need
+  next: set it to \"auto\", or choose another device",
+                    info.name
+                ),
+            });
         }
         if options.deterministic && !(info.int64 && info.int64_atomics) {
             return Err(Error::NoDevice {
@@ -103,25 +143,30 @@ impl Gpu {
         }
         let context = Context::new(instance, physical, &info)?;
         let memory = Memory::new(&context, options.memory_limit)?;
-        let pipelines = Pipelines::new(&context, &info, options.cache_dir.as_deref())?;
+        let pipelines = Pipelines::new(&context, &info, options)?;
         let queue = Queue::new(&context)?;
         let profiler = Profiler::new(&info, context.timestamp_bits);
         if options.profile {
             profiler.check(&info)?;
         }
+        let mut options = options.clone();
+        options.autotune &= !options.deterministic;
+        let tuning_file =
+            (options.cache_dir.as_ref()).map(|dir| dir.join(tuning::file_name(&info)));
         let inner = Inner {
             queue,
             pipelines,
             memory,
             profiler,
+            tuning: Tuning::new(tuning_file),
             info,
-            options: options.clone(),
+            options,
             context,
         };
         let gpu = Gpu {
             inner: Arc::new(inner),
         };
-        if options.profile {
+        if gpu.options().profile {
             gpu.set_clock()?;
         }
         Ok(gpu)
@@ -204,6 +249,9 @@ impl Context {
         if info.full_subgroups.is_some() && !size_control_is_core {
             names.push(ext::subgroup_size_control::NAME.as_ptr());
         }
+        if info.matrix.is_some() {
+            names.push(khr::cooperative_matrix::NAME.as_ptr());
+        }
         let has_memory_budget = offers(ext::memory_budget::NAME);
         if has_memory_budget {
             names.push(ext::memory_budget::NAME.as_ptr());
@@ -220,12 +268,17 @@ impl Context {
             .buffer_device_address(true)
             .scalar_block_layout(true)
             .timeline_semaphore(true)
-            .shader_buffer_int64_atomics(info.int64_atomics);
+            .shader_buffer_int64_atomics(info.int64_atomics)
+            .shader_float16(info.matrix.is_some())
+            .vulkan_memory_model(info.matrix.is_some())
+            .vulkan_memory_model_device_scope(info.matrix.is_some());
         let mut atomics = vk::PhysicalDeviceShaderAtomicFloatFeaturesEXT::default()
             .shader_buffer_float32_atomic_add(true);
         let mut control = vk::PhysicalDeviceSubgroupSizeControlFeatures::default()
             .subgroup_size_control(true)
             .compute_full_subgroups(true);
+        let mut matrices =
+            vk::PhysicalDeviceCooperativeMatrixFeaturesKHR::default().cooperative_matrix(true);
         let mut create = vk::DeviceCreateInfo::default()
             .queue_create_infos(&queues)
             .enabled_extension_names(&names)
@@ -236,6 +289,9 @@ impl Context {
         }
         if info.full_subgroups.is_some() {
             create = create.push_next(&mut control);
+        }
+        if info.matrix.is_some() {
+            create = create.push_next(&mut matrices);
         }
         // SAFETY: only features and extensions that the device offers are asked for; the chain outlives the call.
         let device = unsafe { instance.raw.create_device(physical, &create, None) }

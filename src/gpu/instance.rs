@@ -57,6 +57,8 @@ pub struct DeviceInfo {
     /// Whether a handful of cores do all the work, as on software devices: kernels then keep them apart where a GPU's invocations would
     /// meet in memory, and go through memory in pieces that fit a core's cache.
     pub few_cores: bool,
+    /// (M, N, K) of the products of float16 matrices, M × K by K × N, with float32 sums that a subgroup makes; `None` where there are none, or where the device was opened without them ([`super::GpuOptions::matrices`]).
+    pub matrix: Option<[u32; 3]>,
     /// What this device lacks to run the kernels; empty where it can.
     pub missing: Vec<String>,
     pub(super) int64: bool,
@@ -229,6 +231,7 @@ impl Instance {
             max_workgroup: first.limits.max_compute_work_group_invocations,
             float_atomics: false,
             few_cores: false,
+            matrix: None,
             missing: Vec::new(),
             int64: false,
             int64_atomics: false,
@@ -278,12 +281,17 @@ impl Instance {
         let mut twelve = vk::PhysicalDeviceVulkan12Features::default();
         let mut atomics = vk::PhysicalDeviceShaderAtomicFloatFeaturesEXT::default();
         let mut control = vk::PhysicalDeviceSubgroupSizeControlFeatures::default();
+        let mut matrices = vk::PhysicalDeviceCooperativeMatrixFeaturesKHR::default();
         let mut features = vk::PhysicalDeviceFeatures2::default().push_next(&mut twelve);
         if atomics_offered {
             features = features.push_next(&mut atomics);
         }
         if size_control_offered {
             features = features.push_next(&mut control);
+        }
+        let matrices_offered = offers(khr::cooperative_matrix::NAME);
+        if matrices_offered {
+            features = features.push_next(&mut matrices);
         }
         // SAFETY: as above.
         unsafe {
@@ -314,6 +322,15 @@ impl Instance {
                 .contains(vk::ShaderStageFlags::COMPUTE)
         {
             info.full_subgroups = Some((sizes.min_subgroup_size, sizes.max_subgroup_size));
+        }
+
+        let usable = matrices.cooperative_matrix != 0
+            && twelve.shader_float16 != 0
+            && twelve.vulkan_memory_model != 0
+            && twelve.vulkan_memory_model_device_scope != 0
+            && info.full_subgroups.is_some();
+        if usable {
+            info.matrix = self.matrix(physical)?;
         }
 
         let mut need = |there: bool, what: &str| {
@@ -352,6 +369,27 @@ impl Instance {
             "a compute queue",
         );
         Ok(info)
+    }
+
+    /// The product of cooperative matrices that kernels use: of those that fill the tiles of glsl/lib/cooperative.glsl, the one with the
+    /// fewest instructions.
+    fn matrix(&self, physical: vk::PhysicalDevice) -> Result<Option<[u32; 3]>> {
+        let cooperative = khr::cooperative_matrix::Instance::new(&self.entry, &self.raw);
+        // SAFETY: a device of this instance, which offers the extension.
+        let offered =
+            unsafe { cooperative.get_physical_device_cooperative_matrix_properties(physical) };
+        let offered =
+            offered.map_err(vulkan("vkGetPhysicalDeviceCooperativeMatrixPropertiesKHR"))?;
+        let (half, single) = (vk::ComponentTypeKHR::FLOAT16, vk::ComponentTypeKHR::FLOAT32);
+        let usable = offered.iter().filter(|p| {
+            (p.a_type, p.b_type, p.c_type, p.result_type) == (half, half, single, single)
+                && p.scope == vk::ScopeKHR::SUBGROUP
+                && [(p.m_size, 64), (p.n_size, 64), (p.k_size, 32)]
+                    .iter()
+                    .all(|(size, tile)| tile % size == 0)
+        });
+        let sizes = usable.map(|p| [p.m_size, p.n_size, p.k_size]);
+        Ok(sizes.max_by_key(|size| size.iter().product::<u32>()))
     }
 }
 

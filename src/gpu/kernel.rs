@@ -1,13 +1,13 @@
 //! Kernels: pipelines built from the SPIR-V that build.rs embedded, one for each set of specialisation constants.
 
-use super::device::{Context, Gpu, vulkan};
+use super::device::{Context, Gpu, GpuOptions, Matrices, vulkan};
 use super::instance::DeviceInfo;
 use crate::{Error, Result};
 use ash::vk;
 use bytemuck::Pod;
 use std::collections::HashMap;
 use std::marker::PhantomData;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
 
 /// What build.rs found in a kernel's SPIR-V.
@@ -22,11 +22,19 @@ pub struct KernelModule {
     pub spirv_of_core: Option<&'static [u8]>,
     /// The variant whose gradients do not depend on the order in which they are added up, where the kernel handles any.
     pub deterministic_spirv: Option<&'static [u8]>,
+    /// The same by cooperative matrices, with the same arguments and constants, where the kernel has such a form.
+    pub cooperative: Option<&'static KernelModule>,
     /// The pointers in the push-constant block.
     pub pointers: &'static [PointerArg],
     /// Whether it reads, or writes, through pointers found elsewhere than in the block.
     pub indirect_reads: bool,
     pub indirect_writes: bool,
+}
+
+impl KernelModule {
+    fn is_cooperative(&self) -> bool {
+        self.name.ends_with(".cooperative")
+    }
 }
 
 /// A pointer in a push-constant block.
@@ -94,6 +102,11 @@ impl<A> Kernel<A> {
     pub fn local_size(&self) -> u32 {
         self.module.local_size.iter().product()
     }
+
+    /// Rows and columns of the product that a workgroup computes, where it does so by cooperative matrices (glsl/lib/cooperative.glsl).
+    pub fn matrix_tile(&self) -> Option<[u32; 2]> {
+        self.module.is_cooperative().then_some([64, 64])
+    }
 }
 
 /// A pipeline's identity: kernel and specialisation constants.
@@ -104,6 +117,8 @@ pub(super) struct Pipelines {
     pub(super) layout: vk::PipelineLayout,
     built: Mutex<HashMap<Key, (vk::Pipeline, Arc<str>)>>,
     cache: vk::PipelineCache,
+    /// What cooperative kernels know of the device (glsl/lib/cooperative.glsl).
+    matrix_constants: Vec<(u32, u32)>,
     /// Where the cache lies on disk, and its bytes when it was read.
     cache_file: Option<(PathBuf, usize)>,
     device: ash::Device,
@@ -116,9 +131,10 @@ impl Pipelines {
     pub(super) fn new(
         context: &Context,
         info: &DeviceInfo,
-        cache_dir: Option<&Path>,
+        options: &GpuOptions,
     ) -> Result<Pipelines> {
         let device = &context.device;
+        let cache_dir = options.cache_dir.as_ref();
         let cache_file = cache_dir.map(|dir| dir.join(cache_name(info)));
         let known = cache_file
             .as_ref()
@@ -141,7 +157,13 @@ impl Pipelines {
             unsafe { device.destroy_pipeline_cache(cache, None) };
             vulkan("vkCreatePipelineLayout")(error)
         })?;
+        let compensated = u32::from(options.matrices != Matrices::Float16);
+        let matrix_constants = match info.matrix {
+            Some([m, n, k]) => [m, n, k, info.subgroup_size, compensated],
+            None => [0; 5],
+        };
         Ok(Pipelines {
+            matrix_constants: (100..).zip(matrix_constants).collect(),
             layout,
             built: Mutex::default(),
             cache,
@@ -182,6 +204,10 @@ impl Pipelines {
             (_, Some(fallback)) if !(info.float_atomics && info.int64) => fallback,
             _ => module.spirv,
         };
+        let mut constants = constants.to_vec();
+        if module.is_cooperative() {
+            constants.extend(&self.matrix_constants);
+        }
         let words: Vec<u32> = bytemuck::pod_collect_to_vec(spirv);
         let create = vk::ShaderModuleCreateInfo::default().code(&words);
         // SAFETY: SPIR-V from glslang, of the version that the device's Vulkan 1.2 takes.
@@ -202,19 +228,27 @@ impl Pipelines {
             .map_entries(&entries)
             .data(bytemuck::cast_slice(&values));
         let invocations: u32 = module.local_size.iter().product();
+        let mut size = vk::PipelineShaderStageRequiredSubgroupSizeCreateInfo::default()
+            .required_subgroup_size(info.subgroup_size);
         let flags = match info.full_subgroups {
+            _ if module.is_cooperative() => {
+                vk::PipelineShaderStageCreateFlags::REQUIRE_FULL_SUBGROUPS
+            }
             Some((_, largest)) if module.local_size[0].is_multiple_of(largest) => {
                 vk::PipelineShaderStageCreateFlags::ALLOW_VARYING_SUBGROUP_SIZE
                     | vk::PipelineShaderStageCreateFlags::REQUIRE_FULL_SUBGROUPS
             }
             _ => vk::PipelineShaderStageCreateFlags::empty(),
         };
-        let stage = vk::PipelineShaderStageCreateInfo::default()
+        let mut stage = vk::PipelineShaderStageCreateInfo::default()
             .flags(flags)
             .stage(vk::ShaderStageFlags::COMPUTE)
             .module(shader)
             .name(c"main")
             .specialization_info(&specialization);
+        if module.is_cooperative() {
+            stage = stage.push_next(&mut size);
+        }
         let create = [vk::ComputePipelineCreateInfo::default()
             .flags(vk::PipelineCreateFlags::DISPATCH_BASE)
             .stage(stage)
@@ -243,7 +277,7 @@ impl Pipelines {
 }
 
 /// One file for each device and driver: what one driver compiled, another must not read.
-fn cache_name(info: &DeviceInfo) -> String {
+pub(super) fn cache_name(info: &DeviceInfo) -> String {
     let uuid: String = info
         .cache_uuid
         .iter()
@@ -283,7 +317,24 @@ impl Drop for Pipelines {
 impl Gpu {
     /// The kernel with these specialisation constants, built at the first call.
     pub fn kernel<S: KernelShape>(&self, shape: S) -> Result<Kernel<S::Args>> {
-        let module = S::module();
+        self.kernel_of(S::module(), shape)
+    }
+
+    /// The same by cooperative matrices; [`Kernel::matrix_tile`] divides its work.
+    ///
+    /// # Panics
+    /// If the kernel has no such form, or the device no such matrices.
+    pub fn matrix_kernel<S: KernelShape>(&self, shape: S) -> Result<Kernel<S::Args>> {
+        let module = S::module().cooperative.expect("a cooperative form");
+        assert!(self.inner.info.matrix.is_some(), "cooperative matrices");
+        self.kernel_of(module, shape)
+    }
+
+    fn kernel_of<S: KernelShape>(
+        &self,
+        module: &'static KernelModule,
+        shape: S,
+    ) -> Result<Kernel<S::Args>> {
         let info = &self.inner.info;
         let pipelines = &self.inner.pipelines;
         let key = (module.name, shape.constants());
@@ -330,7 +381,11 @@ mod tests {
                 info,
                 ..
             } = &*gpu.inner;
-            for module in crate::kernels::ALL {
+            let with_matrices = crate::kernels::ALL
+                .iter()
+                .filter_map(|module| module.cooperative)
+                .filter(|_| info.matrix.is_some());
+            for module in crate::kernels::ALL.iter().copied().chain(with_matrices) {
                 let pipeline = pipelines.build(context, info, module, &[], false)?;
                 // SAFETY: nothing uses it.
                 unsafe { context.device.destroy_pipeline(pipeline, None) };

@@ -36,10 +36,11 @@ mod recorder;
 mod reflect;
 mod roofs;
 mod transfer;
+mod tuning;
 mod validation;
 
 pub use buffer::{Buffer, Ptr, PtrMut, Readback};
-pub use device::{Gpu, GpuOptions};
+pub use device::{Gpu, GpuOptions, Matrices};
 pub use instance::{DeviceInfo, DeviceKind};
 pub use kernel::{Kernel, KernelModule, KernelShape, PointerArg};
 pub use memory::{MemoryPlan, Overrun};

@@ -67,6 +67,8 @@ pub struct Module {
     pub constants: Vec<Constant>,
     /// Adds to floats in memory atomically (capability AtomicFloat32AddEXT), or uses 64-bit integers: Vulkan 1.2 has them on some devices.
     pub beyond_core: bool,
+    /// Multiplies by cooperative matrices.
+    pub cooperative: bool,
     /// Reads through pointers that are not members of the block: found in memory, or computed.
     pub indirect_reads: bool,
     /// Writes through such pointers.
@@ -78,6 +80,7 @@ pub struct Module {
 const VIEWS: [&str; 5] = ["reading(", "floats(", "pair_at(", "set_pair(", "add("];
 const CAPABILITY_INT64: u32 = 11;
 const CAPABILITY_ATOMIC_FLOAT32_ADD: u32 = 6033;
+const CAPABILITY_COOPERATIVE_MATRIX: u32 = 6022;
 const DECORATION_SPEC_ID: u32 = 1;
 const DECORATION_ARRAY_STRIDE: u32 = 6;
 const DECORATION_BUILT_IN: u32 = 11;
@@ -243,6 +246,7 @@ impl Module {
             constants,
             beyond_core: capabilities.contains(&CAPABILITY_ATOMIC_FLOAT32_ADD)
                 || capabilities.contains(&CAPABILITY_INT64),
+            cooperative: capabilities.contains(&CAPABILITY_COOPERATIVE_MATRIX),
             indirect_reads: false,
             indirect_writes: false,
         };

@@ -45,7 +45,7 @@ impl Gpu {
             self.buffer::<[u32; 4]>("roof to", n)?,
         );
         let copy = self.kernel(roof_copy::Shape::default())?;
-        let copy_seconds = self.fastest(|rec| {
+        let copy_seconds = self.seconds_of(|rec| {
             let args = roof_copy::Args {
                 from: from.ptr(),
                 to: to.ptr_mut(),
@@ -58,7 +58,7 @@ impl Gpu {
         let shape = roof_fma::Shape::default();
         let flops = 2.0 * 16.0 * 16.0 * shape.rounds as f64;
         let fma = self.kernel(shape)?;
-        let fma_seconds = self.fastest(|rec| {
+        let fma_seconds = self.seconds_of(|rec| {
             let args = roof_fma::Args {
                 sums: sums.ptr_mut(),
                 n: launched as u32,
@@ -89,7 +89,7 @@ impl Gpu {
         let mut measured = Vec::new();
         for &log2_entries in log2_entries {
             let mask = (1u32 << log2_entries) - 1;
-            let gathered = self.fastest(|rec| {
+            let gathered = self.seconds_of(|rec| {
                 let args = roof_gather::Args {
                     table: table.ptr().cast(),
                     sums: sums.ptr_mut(),
@@ -98,7 +98,7 @@ impl Gpu {
                 };
                 rec.run(&gather, Work::items(launched).bytes(512.0), args);
             })?;
-            let scattered = self.fastest(|rec| {
+            let scattered = self.seconds_of(|rec| {
                 let args = roof_scatter::Args {
                     table: table.ptr_mut(),
                     n: launched as u32,
@@ -116,7 +116,7 @@ impl Gpu {
     }
 
     /// Seconds of one launch, from as many at once as take long enough to be timed on the host.
-    fn fastest(&self, mut launch: impl FnMut(&mut super::Recorder)) -> Result<f64> {
+    pub(super) fn seconds_of(&self, mut launch: impl FnMut(&mut super::Recorder)) -> Result<f64> {
         let mut time = |launches: u32| {
             let start = Instant::now();
             let ticket = self.submit("roofs", |rec| {

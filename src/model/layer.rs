@@ -1,5 +1,6 @@
 //! One fully connected layer on planar activations `[channel, n]`: forward, gradient of the inputs, gradient of the weights.
 
+use super::forms::Forms;
 use super::params::{Params, WeightHandle};
 use crate::Result;
 use crate::gpu::{Gpu, Kernel, Ptr, PtrMut, Recorder, Work};
@@ -20,6 +21,7 @@ pub struct Layer {
     /// Rows of the matrix that come before this layer's own (heads share one matrix).
     first_row: u32,
     handle: WeightHandle,
+    forms: Forms,
     forward: Kernel<linear::Args>,
     /// Adjoint with respect to the first `backward_inputs` inputs; none where nobody asks for them.
     backward: Option<(u32, Kernel<linear::Args>)>,
@@ -38,13 +40,22 @@ pub struct LayerShape {
     pub inputs_are_relu: bool,
 }
 
-/// Samples that one workgroup of the weight gradient sums up, and inputs that one of its invocations has.
+/// Samples that one workgroup of the weight gradient sums up.
 const GRADIENT_CHUNK: u32 = 1024;
-const GRADIENT_TILE: u32 = 32;
 
 impl Layer {
-    /// Builds the layer's kernels; `label` names their rows in the profile.
+    /// Builds the layer's kernels, in the forms that suit the device; `label` names their rows in the profile.
     pub fn new(gpu: &Gpu, label: &str, shape: LayerShape, handle: WeightHandle) -> Result<Layer> {
+        Layer::in_forms(gpu, label, shape, handle, Forms::of(gpu)?)
+    }
+
+    pub(super) fn in_forms(
+        gpu: &Gpu,
+        label: &str,
+        shape: LayerShape,
+        handle: WeightHandle,
+        forms: Forms,
+    ) -> Result<Layer> {
         let bias = u32::from(handle.bias.is_some());
         let base = linear::Shape {
             inputs: shape.inputs,
@@ -54,7 +65,7 @@ impl Layer {
             bias,
             activation: shape.activation as u32,
             gated: 0,
-            tile: tile(shape.outputs),
+            tile: forms.linear.tile(shape.outputs),
         };
         let backward = if shape.backward_inputs > 0 {
             let adjoint = linear::Shape {
@@ -64,31 +75,32 @@ impl Layer {
                 bias: 0,
                 activation: 0,
                 gated: u32::from(shape.inputs_are_relu),
-                tile: tile(shape.backward_inputs),
+                tile: forms.linear.tile(shape.backward_inputs),
                 ..base
             };
-            Some((
-                shape.backward_inputs,
-                gpu.kernel(adjoint)?.labelled(&format!("{label} backward")),
-            ))
+            let size = [adjoint.inputs, adjoint.outputs];
+            let kernel = forms.linear.kernel(gpu, size, adjoint)?;
+            let row = format!("{label} backward");
+            Some((shape.backward_inputs, kernel.labelled(&row)))
         } else {
             None
         };
+        let gradient = weight_gradient::Shape {
+            inputs: shape.inputs,
+            outputs: shape.outputs,
+            bias,
+            tile: forms.gradient.tile(shape.inputs),
+        };
+        let size = [shape.inputs, shape.outputs];
         Ok(Layer {
             inputs: shape.inputs,
             outputs: shape.outputs,
             first_row: shape.first_row,
             handle,
-            forward: gpu.kernel(base)?.labelled(&format!("{label} forward")),
+            forms,
+            forward: (forms.linear.kernel(gpu, size, base)?).labelled(&format!("{label} forward")),
             backward,
-            gradient: gpu
-                .kernel(weight_gradient::Shape {
-                    inputs: shape.inputs,
-                    outputs: shape.outputs,
-                    bias,
-                    tile: shape.inputs.min(GRADIENT_TILE),
-                })?
-                .labelled(label),
+            gradient: forms.gradient.kernel(gpu, size, gradient)?.labelled(label),
         })
     }
 
@@ -101,13 +113,23 @@ impl Layer {
         u64::from(self.first_row) * u64::from(self.inputs)
     }
 
-    fn work(&self, n: u32, outputs: u32) -> Work {
-        let slices = outputs.div_ceil(tile(outputs));
+    /// Work of `linear` for so many samples and output channels.
+    fn work(&self, kernel: &Kernel<linear::Args>, n: u32, outputs: u32) -> Work {
+        let (work, samples, slices) = match kernel.matrix_tile() {
+            Some([rows, columns]) => {
+                let groups = n.div_ceil(columns);
+                (Work::groups(groups.into()), columns, outputs.div_ceil(rows))
+            }
+            None => {
+                let tile = self.forms.linear.tile(outputs);
+                (Work::items(n.into()), 1, outputs.div_ceil(tile))
+            }
+        };
         let connections = f64::from(self.inputs) * f64::from(self.outputs);
-        Work::items(u64::from(n))
-            .slices(slices)
-            .flops(2.0 * connections / f64::from(slices))
-            .bytes(4.0 * f64::from(self.inputs + self.outputs) / f64::from(slices))
+        let share = f64::from(samples) / f64::from(slices);
+        work.slices(slices)
+            .flops(2.0 * connections * share)
+            .bytes(4.0 * f64::from(self.inputs + self.outputs) * share)
     }
 
     /// `y [outputs, n]` from `x [inputs, n]`.
@@ -127,7 +149,11 @@ impl Layer {
             y,
             n,
         };
-        rec.run(&self.forward, self.work(n, self.outputs), args);
+        rec.run(
+            &self.forward,
+            self.work(&self.forward, n, self.outputs),
+            args,
+        );
     }
 
     /// `d_x [backward_inputs, n]` from the gradient `d_y [outputs, n]` before the activation; `x` gates it where the inputs are ReLU's.
@@ -152,7 +178,7 @@ impl Layer {
             y: d_x,
             n,
         };
-        rec.run(kernel, self.work(n, *outputs), args);
+        rec.run(kernel, self.work(kernel, n, *outputs), args);
     }
 
     /// Adds the gradients of weights and bias, from `x` (channels `stride_x` apart) and `d_y [outputs, n]`.
@@ -174,22 +200,22 @@ impl Layer {
             stride_x,
             chunk: GRADIENT_CHUNK,
         };
-        let lanes = self.gradient.local_size();
-        let tiles = self.inputs.div_ceil(GRADIENT_TILE);
+        // Outputs and inputs of a workgroup.
+        let [rows, columns] = match self.gradient.matrix_tile() {
+            Some(tile) => tile,
+            None => [
+                self.gradient.local_size(),
+                self.forms.gradient.tile(self.inputs),
+            ],
+        };
+        let chunks = n.div_ceil(GRADIENT_CHUNK);
+        let slices = self.outputs.div_ceil(rows) * self.inputs.div_ceil(columns);
+        let (rows, columns) = (rows.min(self.outputs), columns.min(self.inputs));
         let samples = f64::from(n.min(GRADIENT_CHUNK));
-        let work = Work::groups(u64::from(n.div_ceil(GRADIENT_CHUNK)))
-            .slices(tiles * self.outputs.div_ceil(lanes))
-            .flops(
-                2.0 * f64::from(GRADIENT_TILE.min(self.inputs) * lanes.min(self.outputs)) * samples,
-            )
-            .bytes(
-                4.0 * f64::from(GRADIENT_TILE.min(self.inputs) + lanes.min(self.outputs)) * samples,
-            );
+        let work = Work::groups(chunks.into())
+            .slices(slices)
+            .flops(2.0 * f64::from(rows) * f64::from(columns) * samples)
+            .bytes(4.0 * f64::from(rows + columns) * samples);
         rec.run(&self.gradient, work, args);
     }
-}
-
-/// Output channels per invocation: sixteen, or all of a narrower layer.
-fn tile(outputs: u32) -> u32 {
-    outputs.min(16)
 }

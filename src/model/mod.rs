@@ -3,6 +3,7 @@
 mod appearance;
 mod background;
 mod field;
+mod forms;
 mod hash_grid;
 mod layer;
 mod lazy_table;
@@ -13,7 +14,7 @@ mod surface;
 pub use background::{Background, BackgroundBuffers, BackgroundRays};
 pub use field::{Field, FieldBuffers, FieldShape, Scratch};
 pub use hash_grid::HashGrid;
-pub use layer::{Activation, Layer};
+pub use layer::{Activation, Layer, LayerShape};
 pub use lazy_table::{LazyTable, Rates};
 pub use params::{Group, Init, Params, ParamsPlan, Span, WeightHandle};
 pub use proposal::{Proposal, ProposalBuffers};

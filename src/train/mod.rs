@@ -71,6 +71,15 @@ impl Trainer {
                 ),
             });
         }
+        if config.matrices != gpu.options().matrices {
+            return Err(Error::Config {
+                what: format!(
+                    "matrices = {:?}, but the device was opened with GpuOptions::matrices = {:?}",
+                    config.matrices,
+                    gpu.options().matrices
+                ),
+            });
+        }
         let training: Vec<usize> = scene.split(Split::Train).collect();
         let held_out: Vec<usize> = scene.split(Split::Test).collect();
         let preview = run::PreviewView::choose(scene, config);

@@ -8,6 +8,7 @@ mod errors;
 mod launches;
 mod memory;
 mod order;
+mod tuning;
 
 fn open() -> Result<Gpu> {
     Gpu::new(&GpuOptions::default())

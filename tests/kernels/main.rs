@@ -2,6 +2,7 @@
 
 mod field_chunks;
 mod harness;
+mod layer;
 mod lazy_table;
 #[path = "../reference/optimizer.rs"]
 mod optimizer;

@@ -74,6 +74,7 @@ impl Rig {
             guard: true,
             validation: true,
             portable,
+            matrices: config.matrices,
             ..GpuOptions::default()
         })?;
         let trainer = Trainer::new(&gpu, &scene, &region, &config)?;

@@ -10,6 +10,7 @@ use crate::rig::{GradientRange, Rig, agreement, interleaved};
 use glam::dvec3;
 use neurodin::Result;
 use neurodin::config::{BackgroundKind, BiasReduction, Config, MaskUse};
+use neurodin::gpu::{Gpu, GpuOptions, Matrices};
 use neurodin::model::Group;
 use neurodin::render::TERMS;
 use neurodin::scene::RegionShape;
@@ -117,6 +118,24 @@ fn method(name: &str) -> Config {
 #[test]
 fn by_the_portable_kernels() -> Result<()> {
     check(preset("outdoor-tiny"), RegionShape::Sphere, 9, true)
+}
+
+/// Layers are 64 wide here, and the matrices' operands keep what float16 drops: the bar is that of float32.
+#[test]
+fn both_stages_by_compensated_matrices() -> Result<()> {
+    let wanted = GpuOptions {
+        matrices: Matrices::Compensated,
+        ..GpuOptions::default()
+    };
+    if let Err(error) = Gpu::new(&wanted) {
+        println!("skipped: {error}");
+        return Ok(());
+    }
+    for mut config in [preset("outdoor-tiny"), second("outdoor-tiny")] {
+        config.matrices = Matrices::Compensated;
+        check(config, RegionShape::Sphere, 9, false)?;
+    }
+    Ok(())
 }
 
 #[test]

@@ -1,0 +1,89 @@
+//! Which of several ways of doing the same is fastest on this device: measured once, remembered beside the pipeline cache.
+
+use super::device::Gpu;
+use super::kernel::cache_name;
+use super::recorder::Recorder;
+use crate::{Error, Result};
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::sync::Mutex;
+
+/// Answers by question, as names of ways.
+pub(super) struct Tuning {
+    answers: Mutex<BTreeMap<String, String>>,
+    file: Option<PathBuf>,
+}
+
+/// A way takes the place of the first where it needs no more than this share of its time: less of a difference is noise.
+const WORTH: f64 = 0.9;
+
+impl Tuning {
+    /// What is known already. An unreadable file is no error: what it said is measured again.
+    pub(super) fn new(file: Option<PathBuf>) -> Tuning {
+        let text = file
+            .as_ref()
+            .and_then(|file| std::fs::read_to_string(file).ok());
+        let answers = text.and_then(|text| serde_json::from_str(&text).ok());
+        Tuning {
+            answers: Mutex::new(answers.unwrap_or_default()),
+            file,
+        }
+    }
+
+    fn save(&self, answers: &BTreeMap<String, String>) -> Result<()> {
+        let Some(file) = &self.file else {
+            return Ok(());
+        };
+        let failed = |error| Error::io(file, error);
+        std::fs::create_dir_all(file.parent().expect("a file in a folder")).map_err(failed)?;
+        let text = serde_json::to_string_pretty(answers).expect("names are text");
+        let beside = file.with_extension(format!("{}.part", std::process::id()));
+        std::fs::write(&beside, text + "\n").map_err(failed)?;
+        std::fs::rename(&beside, file).map_err(failed)
+    }
+}
+
+/// The file of a device and driver, beside its pipelines.
+pub(super) fn file_name(info: &super::DeviceInfo) -> String {
+    cache_name(info)
+        .replace("pipelines", "tuning")
+        .replace(".bin", ".json")
+}
+
+impl Gpu {
+    /// The fastest of some `ways` of doing the same, each under a name: an index. `question` names what is done; `prepare` makes what
+    /// `run` records it with, where it is not known yet. Where the device was opened without [`super::GpuOptions::autotune`], it is the
+    /// first.
+    ///
+    /// # Errors
+    /// What `prepare`, `run` or the device fails with.
+    pub fn fastest<T>(
+        &self,
+        question: &str,
+        ways: &[String],
+        prepare: impl FnOnce() -> Result<T>,
+        mut run: impl FnMut(&T, usize, &mut Recorder),
+    ) -> Result<usize> {
+        if !self.options().autotune || ways.len() < 2 {
+            return Ok(0);
+        }
+        let tuning = &self.inner.tuning;
+        let mut answers = tuning.answers.lock().expect("no panic under the lock");
+        let known = answers.get(question);
+        if let Some(way) = known.and_then(|known| ways.iter().position(|way| way == known)) {
+            return Ok(way);
+        }
+        let prepared = prepare()?;
+        let mut seconds = Vec::new();
+        for way in 0..ways.len() {
+            seconds.push(self.seconds_of(|rec| run(&prepared, way, rec))?);
+        }
+        let fastest = (0..ways.len()).min_by(|&a, &b| seconds[a].total_cmp(&seconds[b]));
+        let better = fastest.filter(|&way| seconds[way] < WORTH * seconds[0]);
+        let chosen = better.unwrap_or(0);
+        answers.insert(question.into(), ways[chosen].clone());
+        // An answer that cannot be kept costs time at the next start, and nothing else.
+        let _ = tuning.save(&answers);
+        Ok(chosen)
+    }
+}

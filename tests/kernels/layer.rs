@@ -1,0 +1,198 @@
+//! A layer's three products against float64, in each way in which a device may multiply matrices.
+
+use crate::harness::Random;
+use neurodin::gpu::{Buffer, Gpu, GpuOptions, Matrices};
+use neurodin::model::{Activation, Group, Init, Layer, LayerShape, ParamsPlan, WeightHandle};
+use neurodin::{Error, Result};
+
+/// (inputs, outputs, samples): narrow, odd in every direction, and several tiles of everything.
+const SIZES: [(usize, usize, usize); 4] =
+    [(5, 3, 70), (70, 37, 333), (64, 64, 64), (256, 258, 1100)];
+
+struct Case {
+    inputs: usize,
+    outputs: usize,
+    n: usize,
+    weight: Vec<f64>, // [outputs, inputs]
+    bias: Vec<f64>,
+    x: Vec<f64>,   // [inputs, n] of a ReLU
+    d_y: Vec<f64>, // [outputs, n]
+}
+
+impl Case {
+    /// Inputs and gradients of all sizes, as networks have them: features far below 1, gradients of a mean over many rays.
+    fn new((inputs, outputs, n): (usize, usize, usize), random: &mut Random) -> Case {
+        let mut planes = |rows: usize, most: f64| -> Vec<f64> {
+            let rows = (0..rows).flat_map(|_| {
+                let scale = most * random.uniform(-8.0, 0.0).exp();
+                random.many(n, -scale, scale)
+            });
+            rows.map(|x| f64::from(x as f32)).collect()
+        };
+        let x = planes(inputs, 3.0)
+            .into_iter()
+            .map(|x| x.max(0.0))
+            .collect();
+        let d_y = planes(outputs, 1e-7);
+        let weight = random.many(outputs * inputs, -0.2, 0.2);
+        Case {
+            inputs,
+            outputs,
+            n,
+            weight,
+            bias: random.many(outputs, -1.0, 1.0),
+            x,
+            d_y,
+        }
+    }
+
+    /// Wx + b, gated Wᵀd_y, d_y xᵀ and Σ d_y.
+    fn twin(&self) -> [Vec<f64>; 4] {
+        let (inputs, outputs, n) = (self.inputs, self.outputs, self.n);
+        let mut y: Vec<f64> = (0..outputs * n).map(|i| self.bias[i / n]).collect();
+        let mut d_x = vec![0.0; inputs * n];
+        let mut d_weight = vec![0.0; outputs * inputs];
+        for o in 0..outputs {
+            for i in 0..inputs {
+                let w = self.weight[o * inputs + i];
+                for s in 0..n {
+                    let (x, d) = (self.x[i * n + s], self.d_y[o * n + s]);
+                    y[o * n + s] += w * x;
+                    d_x[i * n + s] += if x > 0.0 { w * d } else { 0.0 };
+                    d_weight[o * inputs + i] += d * x;
+                }
+            }
+        }
+        let d_bias = self.d_y.chunks(n).map(|row| row.iter().sum()).collect();
+        [y, d_x, d_weight, d_bias]
+    }
+
+    /// The same by the kernels.
+    fn device(&self, gpu: &Gpu) -> Result<[Vec<f64>; 4]> {
+        let (inputs, outputs, n) = (self.inputs as u32, self.outputs as u32, self.n as u32);
+        let single = |values: &[f64]| values.iter().map(|&x| x as f32).collect::<Vec<f32>>();
+        let mut plan = ParamsPlan::default();
+        let weights = single(&self.weight);
+        let matrix = plan.add_plain(
+            Group::Fields,
+            "weight",
+            outputs.into(),
+            inputs.into(),
+            weights,
+        );
+        let bias = Init::Values(single(&self.bias));
+        let bias = plan.add(Group::Fields, "bias", &[outputs.into()], bias);
+        let handle = WeightHandle {
+            bias: Some(bias),
+            ..matrix
+        };
+        let shape = LayerShape {
+            inputs,
+            outputs,
+            first_row: 0,
+            activation: Activation::None,
+            backward_inputs: inputs,
+            inputs_are_relu: true,
+        };
+        let layer = Layer::new(gpu, "layer", shape, handle)?;
+        let params = plan.build(gpu, 1, true)?;
+        let filled = |name: &str, values: &[f64]| -> Result<Buffer<f32>> {
+            let buffer = gpu.buffer(name, values.len() as u64)?;
+            gpu.upload(&buffer, 0, &single(values)).map(|()| buffer)
+        };
+        let (x, d_y) = (filled("x", &self.x)?, filled("d_y", &self.d_y)?);
+        let y = gpu.scratch("y", u64::from(outputs * n))?;
+        let d_x = gpu.scratch("d_x", u64::from(inputs * n))?;
+        gpu.submit("layer", |rec| {
+            layer.forward(rec, &params, x.ptr(), y.ptr_mut(), n);
+            layer.backward(rec, &params, d_y.ptr(), x.ptr(), d_x.ptr_mut(), n);
+            layer.gradient(rec, &params, x.ptr(), n, d_y.ptr(), n);
+            Ok(())
+        })?;
+        let wide = |values: Vec<f32>| values.into_iter().map(f64::from).collect();
+        let grads = |first, len| gpu.download(params.grads(), first, len).map(wide);
+        Ok([
+            gpu.download(&y, 0, y.len()).map(wide)?,
+            gpu.download(&d_x, 0, d_x.len()).map(wide)?,
+            grads(0, u64::from(outputs * inputs))?,
+            grads(bias, outputs.into())?,
+        ])
+    }
+}
+
+/// Every product within a relative L2 distance, guard words whole, nothing to say for the validation layer.
+fn check(matrices: Matrices, portable: bool, most: f64) -> Result<()> {
+    let gpu = Gpu::new(&GpuOptions {
+        validation: true,
+        guard: true,
+        portable,
+        matrices,
+        ..GpuOptions::default()
+    })?;
+    let mut random = Random(11);
+    for size in SIZES {
+        let case = Case::new(size, &mut random);
+        let products = ["y", "d_x", "d_weight", "d_bias"].into_iter();
+        for ((product, got), want) in products.zip(case.device(&gpu)?).zip(case.twin()) {
+            let power: f64 = want.iter().map(|x| x * x).sum();
+            let error: f64 = got.iter().zip(&want).map(|(a, b)| (a - b).powi(2)).sum();
+            let distance = (error / power).sqrt();
+            println!("{matrices:?} {size:?} {product}: relative L2 {distance:.1e}");
+            assert!(distance <= most, "{size:?} {product}: {distance:e}");
+        }
+    }
+    gpu.finish()?;
+    let overruns = gpu.check_guards()?;
+    assert!(overruns.is_empty(), "written past an end: {overruns:?}");
+    let messages = gpu.validation_messages();
+    assert!(messages.is_empty(), "{}", messages.join("\n"));
+    Ok(())
+}
+
+/// Whether the device has matrices to multiply with; says so where it has none.
+fn has_matrices() -> Result<bool> {
+    let gpu = Gpu::new(&GpuOptions::default())?;
+    let there = gpu.info().matrix.is_some();
+    if !there {
+        println!("skipped: {} has no cooperative matrices", gpu.info().name);
+    }
+    Ok(there)
+}
+
+#[test]
+fn in_float32() -> Result<()> {
+    check(Matrices::Off, false, 1e-6)?;
+    check(Matrices::Off, true, 1e-6)
+}
+
+#[test]
+fn by_matrices_compensated() -> Result<()> {
+    if !has_matrices()? {
+        return Ok(());
+    }
+    check(Matrices::Compensated, false, 1e-6)
+}
+
+#[test]
+fn by_matrices_of_float16() -> Result<()> {
+    if !has_matrices()? {
+        return Ok(());
+    }
+    check(Matrices::Float16, false, 1e-3)
+}
+
+#[test]
+fn matrices_that_are_not_there_are_refused() -> Result<()> {
+    let wanted = GpuOptions {
+        matrices: Matrices::Float16,
+        ..GpuOptions::default()
+    };
+    match Gpu::new(&wanted) {
+        Ok(_) => assert!(has_matrices()?),
+        Err(error) => assert!(
+            matches!(&error, Error::NoDevice { what } if what.contains("matrices = \"float16\"")),
+            "{error}"
+        ),
+    }
+    Ok(())
+}
