@@ -26,7 +26,7 @@ pub struct Config {
     pub seed: u32,
     /// The same run comes out in the same bits, on one device: gradients add up in fixed point, and no clock decides what is computed.
     pub deterministic: bool,
-    /// How wide layers are multiplied.
+    /// How wide layers and networks are multiplied.
     pub matrices: Matrices,
     /// Length of the stage. The schedules below are written for `schedule_steps` and stretched to this.
     pub steps: u64,
@@ -56,6 +56,8 @@ pub struct Stage2Config {
     /// Length of the stage; 0: there is none.
     pub steps: u64,
     pub rays: u32,
+    /// Over these the learning rates of networks and hash table rise from 0.
+    pub warmup: u64,
     pub eikonal: f64,
     /// Weight of the tangent-normal loss.
     pub tangent: f64,
@@ -74,6 +76,8 @@ impl Config {
         config.first_step = self.first_step + self.steps;
         config.steps = stage2.steps;
         config.rays = stage2.rays;
+        config.optimizer.fields.warmup = stage2.warmup;
+        config.optimizer.table.warmup = stage2.warmup;
         config.surface.gradient = GradientKind::Analytic;
         config.surface.density = DensityKind::Sight;
         config.loss.eikonal = stage2.eikonal;

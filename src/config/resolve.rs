@@ -536,6 +536,21 @@ mod tests {
             [&outdoor, &hall, &room].map(|config| config.stage2.rays),
             [8192, 8192, 512]
         );
+        for config in [&outdoor, &hall, &room] {
+            let second = config.second_stage().expect("two stages");
+            let rise = |config: &Config| {
+                [
+                    config.optimizer.fields.warmup,
+                    config.optimizer.table.warmup,
+                ]
+            };
+            assert_eq!(rise(config), [5000, 5000]);
+            assert_eq!(rise(&second), [5000, 5000]);
+        }
+        let tiny = Config::preset("outdoor-tiny").expect("a preset");
+        let second = tiny.second_stage().expect("two stages");
+        assert_eq!(second.optimizer.table.warmup, 60_000);
+        assert_eq!(tiny.optimizer.table.warmup, 5000);
     }
 
     #[test]

@@ -142,6 +142,7 @@ impl Config {
         wrong.scale_bound("stage2.scale_bound", &self.stage2.scale_bound);
         wrong.whole("stage2.steps", self.stage2.steps, 0, 100_000_000);
         wrong.whole("stage2.rays", self.stage2.rays, 1, 65_536);
+        wrong.whole("stage2.warmup", self.stage2.warmup, 0, 100_000_000);
         wrong.real("stage2.tangent", self.stage2.tangent, 0.0, 1e3);
 
         let optimizer = &self.optimizer;
