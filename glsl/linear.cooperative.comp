@@ -40,13 +40,14 @@ float b_at(uint k, uint s) {
     return k < INPUTS && sample_ < n ? x.at[k * n + sample_] : 0.0;
 }
 
-void take(uint m, uint s, float value) {
+float take(uint m, uint s, float value) {
     uint o = first_output() + m, sample_ = first_sample() + s;
-    if (o >= OUTPUTS || sample_ >= n) return;
+    if (o >= OUTPUTS || sample_ >= n) return 0.0;
     uint at = o * n + sample_;
     if (BIAS != 0u) value += bias.at[o];
     if (GATED != 0u && !(gate.at[at] > 0.0)) value = 0.0;
     y.at[at] = activated(value);
+    return 0.0;
 }
 
 void main() {

@@ -39,9 +39,10 @@ float b_at(uint s, uint input_) {
     return i < INPUTS && s < n ? x.at[i * stride_x + s] : 0.0;
 }
 
-void take(uint m, uint input_, float value) {
+float take(uint m, uint input_, float value) {
     uint o = first_output() + m, i = first_input() + input_;
     if (o < OUTPUTS && i < INPUTS) add(d_weight, o * INPUTS + i, value);
+    return 0.0;
 }
 
 void main() {

@@ -82,8 +82,17 @@ vec2 load_chunk(uint k0) {
     return vec2(power_of_two(254u - exponent.x), power_of_two(254u - exponent.y));
 }
 
-// What becomes of a number of C.
-void take(uint m, uint n, float value);
+// What becomes of a number of C; what it returns is summed up where the including kernel defines SUM_ROWS or SUM_COLUMNS.
+float take(uint m, uint n, float value);
+
+#ifdef SUM_ROWS
+// The sum over n of what `take` returned.
+void take_row(uint m, float sum);
+#endif
+#ifdef SUM_COLUMNS
+// Of each column, what each subgroup has of its sum: cleared and read by the kernel.
+shared float column_sums[SUBGROUPS * TILE_N];
+#endif
 
 // C = A B over k in begin .. end, number by number to `take`.
 void multiply(uint begin, uint end) {
@@ -116,16 +125,33 @@ void multiply(uint begin, uint end) {
         }
     }
     // Subgroups without a row go along: barriers are for all of them.
-    uint first = gl_SubgroupID * MATRIX_M * MATRIX_N;
+    uint first = gl_SubgroupID * MATRIX_M * MATRIX_N, lane = gl_SubgroupInvocationID;
     [[unroll]] for (uint r = 0u; r < ROWS_EACH; ++r) {
         uint row = gl_SubgroupID + r * SUBGROUPS;
         uint end_element = row < ROWS ? MATRIX_M * MATRIX_N : 0u;
+        float row_sum = 0.0;
         [[unroll]] for (uint c = 0u; c < COLUMNS; ++c) {
             coopMatStore(sums[r * COLUMNS + c], patches, first, MATRIX_N, gl_CooperativeMatrixLayoutRowMajor);
             subgroupBarrier();
-            for (uint e = gl_SubgroupInvocationID; e < end_element; e += SUBGROUP)
-                take(row * MATRIX_M + e / MATRIX_N, c * MATRIX_N + e % MATRIX_N, patches[first + e]);
+            for (uint e = lane; e < end_element; e += SUBGROUP)
+                patches[first + e] = take(row * MATRIX_M + e / MATRIX_N, c * MATRIX_N + e % MATRIX_N, patches[first + e]);
             subgroupBarrier();
+#ifdef SUM_ROWS
+            if (lane < MATRIX_M) {
+                for (uint n = 0u; n < MATRIX_N; ++n) row_sum += patches[first + lane * MATRIX_N + n];
+            }
+            subgroupBarrier();
+#endif
+#ifdef SUM_COLUMNS
+            if (lane < MATRIX_N && row < ROWS) {
+                uint at = gl_SubgroupID * TILE_N + c * MATRIX_N + lane;
+                for (uint m = 0u; m < MATRIX_M; ++m) column_sums[at] += patches[first + m * MATRIX_N + lane];
+            }
+            subgroupBarrier();
+#endif
         }
+#ifdef SUM_ROWS
+        if (lane < MATRIX_M && row < ROWS) take_row(row * MATRIX_M + lane, row_sum);
+#endif
     }
 }

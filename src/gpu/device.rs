@@ -32,7 +32,7 @@ pub struct GpuOptions {
     /// Adds gradients up so that their order does not count: the same run comes out in the same bits, on one device. Needs 64-bit
     /// atomics, which `portable` leaves alone.
     pub deterministic: bool,
-    /// How wide layers are multiplied.
+    /// How wide layers and networks are multiplied.
     pub matrices: Matrices,
     /// Measures which shapes of kernels are fastest here, at the first start, and remembers it in the cache folder. Without it, and with
     /// `deterministic`, everything has its usual shape.
@@ -55,7 +55,7 @@ pub enum Matrices {
     Off,
     /// Each operand in two float16s: three products, as exact as float32.
     Compensated,
-    /// Operands rounded to float16.
+    /// Operands rounded to float16, but for those of which a gradient is taken by differences.
     Float16,
 }
 

@@ -330,7 +330,7 @@ impl Instance {
             && twelve.vulkan_memory_model_device_scope != 0
             && info.full_subgroups.is_some();
         if usable {
-            info.matrix = self.matrix(physical)?;
+            info.matrix = self.matrix(physical, info.subgroup_size)?;
         }
 
         let mut need = |there: bool, what: &str| {
@@ -371,9 +371,9 @@ impl Instance {
         Ok(info)
     }
 
-    /// The product of cooperative matrices that kernels use: of those that fill the tiles of glsl/lib/cooperative.glsl, the one with the
-    /// fewest instructions.
-    fn matrix(&self, physical: vk::PhysicalDevice) -> Result<Option<[u32; 3]>> {
+    /// The product of cooperative matrices that kernels use: of those that fill the tiles of glsl/lib/cooperative.glsl and have no more
+    /// rows or columns than the subgroup has invocations, the largest.
+    fn matrix(&self, physical: vk::PhysicalDevice, subgroup: u32) -> Result<Option<[u32; 3]>> {
         let cooperative = khr::cooperative_matrix::Instance::new(&self.entry, &self.raw);
         // SAFETY: a device of this instance, which offers the extension.
         let offered =
@@ -387,6 +387,7 @@ impl Instance {
                 && [(p.m_size, 64), (p.n_size, 64), (p.k_size, 32)]
                     .iter()
                     .all(|(size, tile)| tile % size == 0)
+                && p.m_size.max(p.n_size) <= subgroup
         });
         let sizes = usable.map(|p| [p.m_size, p.n_size, p.k_size]);
         Ok(sizes.max_by_key(|size| size.iter().product::<u32>()))

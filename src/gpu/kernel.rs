@@ -1,6 +1,6 @@
 //! Kernels: pipelines built from the SPIR-V that build.rs embedded, one for each set of specialisation constants.
 
-use super::device::{Context, Gpu, GpuOptions, Matrices, vulkan};
+use super::device::{Context, Gpu, GpuOptions, vulkan};
 use super::instance::DeviceInfo;
 use crate::{Error, Result};
 use ash::vk;
@@ -117,12 +117,15 @@ pub(super) struct Pipelines {
     pub(super) layout: vk::PipelineLayout,
     built: Mutex<HashMap<Key, (vk::Pipeline, Arc<str>)>>,
     cache: vk::PipelineCache,
-    /// What cooperative kernels know of the device (glsl/lib/cooperative.glsl).
+    /// What cooperative kernels know of the device (glsl/lib/cooperative.glsl: from constant 100 on).
     matrix_constants: Vec<(u32, u32)>,
     /// Where the cache lies on disk, and its bytes when it was read.
     cache_file: Option<(PathBuf, usize)>,
     device: ash::Device,
 }
+
+/// The constant of glsl/lib/cooperative.glsl that the caller decides.
+const COMPENSATED: u32 = 104;
 
 /// Bytes of push constants that the common pipeline layout has; build.rs holds every kernel to them.
 const PUSH_CONSTANT_BYTES: u32 = 128;
@@ -157,13 +160,9 @@ impl Pipelines {
             unsafe { device.destroy_pipeline_cache(cache, None) };
             vulkan("vkCreatePipelineLayout")(error)
         })?;
-        let compensated = u32::from(options.matrices != Matrices::Float16);
-        let matrix_constants = match info.matrix {
-            Some([m, n, k]) => [m, n, k, info.subgroup_size, compensated],
-            None => [0; 5],
-        };
+        let [m, n, k] = info.matrix.unwrap_or_default();
         Ok(Pipelines {
-            matrix_constants: (100..).zip(matrix_constants).collect(),
+            matrix_constants: (100..).zip([m, n, k, info.subgroup_size]).collect(),
             layout,
             built: Mutex::default(),
             cache,
@@ -317,27 +316,33 @@ impl Drop for Pipelines {
 impl Gpu {
     /// The kernel with these specialisation constants, built at the first call.
     pub fn kernel<S: KernelShape>(&self, shape: S) -> Result<Kernel<S::Args>> {
-        self.kernel_of(S::module(), shape)
+        self.kernel_of(S::module(), shape.constants())
     }
 
-    /// The same by cooperative matrices; [`Kernel::matrix_tile`] divides its work.
+    /// The same by cooperative matrices, operands in two float16s (`compensated`) or one; [`Kernel::matrix_tile`] divides its work.
     ///
     /// # Panics
     /// If the kernel has no such form, or the device no such matrices.
-    pub fn matrix_kernel<S: KernelShape>(&self, shape: S) -> Result<Kernel<S::Args>> {
+    pub fn matrix_kernel<S: KernelShape>(
+        &self,
+        shape: S,
+        compensated: bool,
+    ) -> Result<Kernel<S::Args>> {
         let module = S::module().cooperative.expect("a cooperative form");
         assert!(self.inner.info.matrix.is_some(), "cooperative matrices");
-        self.kernel_of(module, shape)
+        let mut constants = shape.constants();
+        constants.push((COMPENSATED, u32::from(compensated)));
+        self.kernel_of(module, constants)
     }
 
-    fn kernel_of<S: KernelShape>(
+    fn kernel_of<A>(
         &self,
         module: &'static KernelModule,
-        shape: S,
-    ) -> Result<Kernel<S::Args>> {
+        constants: Vec<(u32, u32)>,
+    ) -> Result<Kernel<A>> {
         let info = &self.inner.info;
         let pipelines = &self.inner.pipelines;
-        let key = (module.name, shape.constants());
+        let key = (module.name, constants);
         let mut built = pipelines.built.lock().expect("no panic under the lock");
         let (pipeline, row) = match built.get(&key) {
             Some((pipeline, row)) => (*pipeline, row.clone()),

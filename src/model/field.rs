@@ -1,5 +1,6 @@
 //! A field: hash grid, one hidden layer and a first output. The SDF, the proposal densities and the background density are fields.
 
+use super::forms::Forms;
 use super::hash_grid::HashGrid;
 use super::layer::{Activation, Layer, LayerShape};
 use super::params::{Params, WeightHandle};
@@ -65,11 +66,14 @@ pub struct Field {
     encoding: Kernel<field_forward::Args>,
     /// The network, together with its input where that is not `apart`.
     forward: Network<field_forward::Args>,
-    /// Whether the device's caches hold one level of the table but not all: then each is encoded before the network begins.
+    /// Each level is encoded before the network begins: where the device's caches hold one level of the table but not all, or where the
+    /// network is one of matrices.
     apart: bool,
+    /// The network's backward pass ends before its first layer, whose inputs' gradients the layer itself computes, all of them.
+    by_matrices: bool,
     backward: Network<field_backward::Args>,
     scatter: Scatter,
-    hidden_gradient: Layer,
+    hidden_layer: Layer,
     by_chain_rule: Option<GradientKernels>,
 }
 
@@ -166,7 +170,7 @@ impl FieldBuffers {
 /// Memory that a field's backward pass needs only while it runs, for m points at once; one for all fields.
 pub struct Scratch {
     d_preactivation: Buffer<f32>, // [hidden, m] of the largest field
-    d_inputs: Buffer<f32>, // [inputs, m] of the largest field; only the hash features' rows where there is no gradient
+    d_inputs: Buffer<f32>, // [inputs, m] of the largest field; only the hash features' rows where nobody asks for the others
     steepness: Buffer<f32>, // [hidden, m] of the largest field with a gradient: s
     tangents: Buffer<f32>, // [inputs, m] of the largest field with a gradient: ȧ
 }
@@ -243,26 +247,36 @@ impl Field {
             heads: 1,
             second_order,
         };
-        let hidden_layer = || LayerShape {
+        let few_cores = gpu.info().few_cores;
+        // Always compensated: a gradient by finite differences would not survive float16.
+        let by_matrices = (Forms::of(gpu)?.linear).by_matrices([shape.inputs(), shape.hidden]);
+        let hidden_layer = |backward_inputs| LayerShape {
             inputs: shape.inputs(),
             outputs: shape.hidden,
             first_row: 0,
             activation: Activation::None,
-            backward_inputs: 0,
+            backward_inputs,
             inputs_are_relu: false,
         };
-        let few_cores = gpu.info().few_cores;
         let forward_part = |part, heads, name: &str| -> Result<_> {
             let shape = field_forward::Shape {
                 part,
                 heads,
                 ..forward
             };
-            Ok(gpu.kernel(shape)?.labelled(name))
+            let kernel = match by_matrices && part == 2 {
+                true => gpu.matrix_kernel(shape, true)?,
+                false => gpu.kernel(shape)?,
+            };
+            Ok(kernel.labelled(name))
         };
         let backward = |heads| -> Result<_> {
             let shape = field_backward::Shape { heads, ..backward };
-            Ok(gpu.kernel(shape)?.labelled(label))
+            let kernel = match by_matrices {
+                true => gpu.matrix_kernel(shape, true)?,
+                false => gpu.kernel(shape)?,
+            };
+            Ok(kernel.labelled(label))
         };
         let network = format!("{label} network");
         let by_chain_rule = match shape.gradient {
@@ -297,7 +311,7 @@ impl Field {
                 steepness: Layer::new(
                     gpu,
                     &format!("{label} steepness"),
-                    hidden_layer(),
+                    hidden_layer(0),
                     hidden.without_bias(),
                 )?,
             }),
@@ -309,17 +323,18 @@ impl Field {
             heads,
             levels,
             encoding: forward_part(1, 0, &format!("{label} encoding"))?,
-            forward: match few_cores {
-                true => Network {
-                    kernel: forward_part(2, 1, &network)?,
-                    headless: Some(forward_part(2, 0, &network)?),
+            forward: Network {
+                kernel: match few_cores || by_matrices {
+                    true => forward_part(2, 1, &network)?,
+                    false => forward_part(0, 1, label)?,
                 },
-                false => Network {
-                    kernel: forward_part(0, 1, label)?,
-                    headless: None,
+                headless: match few_cores {
+                    true => Some(forward_part(2, 0, &network)?),
+                    false => None,
                 },
             },
-            apart: few_cores,
+            apart: few_cores || by_matrices,
+            by_matrices,
             backward: Network {
                 kernel: backward(1)?,
                 headless: match few_cores {
@@ -345,7 +360,12 @@ impl Field {
                     Scatter::Atomic(gpu.kernel(shape)?.labelled(label))
                 }
             },
-            hidden_gradient: Layer::new(gpu, &format!("{label} hidden"), hidden_layer(), hidden)?,
+            hidden_layer: Layer::new(
+                gpu,
+                &format!("{label} hidden"),
+                hidden_layer(if by_matrices { shape.inputs() } else { 0 }),
+                hidden,
+            )?,
             by_chain_rule,
             shape,
         })
@@ -390,7 +410,7 @@ impl Field {
             bytes = 2.0 * bytes + self.gather_bytes();
         }
         for (kernel, launch) in self.forward.launches(0..buffers.n, buffers.n_hidden) {
-            let work = Work::items(launch.len() as u64).flops(flops).bytes(bytes);
+            let work = work_of(kernel, launch.len(), flops, bytes);
             let args = self.forward_args(params, points, buffers, first, launch);
             rec.run(kernel, work, args);
         }
@@ -549,18 +569,24 @@ impl Field {
             first: chunk.start,
             m,
         };
-        let products = if self.shape.gradient { 3.0 } else { 2.0 };
+        let products = match (self.shape.gradient, self.by_matrices) {
+            (true, false) => 3.0,
+            (false, true) => 1.0,
+            _ => 2.0,
+        };
         for (kernel, launch) in self.backward.launches(chunk.clone(), buffers.n_hidden) {
             (args.begin, args.end) = (launch.start, launch.end);
-            let work = Work::items(launch.len() as u64)
-                .flops(products * self.hidden_flops())
-                .bytes(products * self.row_bytes() + 4.0 * f64::from(self.shape.hidden));
+            let bytes = products * self.row_bytes() + 4.0 * f64::from(self.shape.hidden);
+            let work = work_of(kernel, launch.len(), products * self.hidden_flops(), bytes);
             rec.run(kernel, work, args);
         }
         let inputs = buffers.inputs.ptr().offset(u64::from(chunk.start));
-        let d_preactivation = scratch.d_preactivation.ptr();
-        self.hidden_gradient
-            .gradient(rec, params, inputs, n, d_preactivation, m);
+        let (layer, d_preactivation) = (&self.hidden_layer, scratch.d_preactivation.ptr());
+        if self.by_matrices {
+            let d_inputs = scratch.d_inputs.ptr_mut();
+            layer.backward(rec, params, d_preactivation, inputs, d_inputs, m);
+        }
+        layer.gradient(rec, params, inputs, n, d_preactivation, m);
         if let Some(kernels) = &self.by_chain_rule {
             let (tangents, steepness) = (scratch.tangents.ptr(), scratch.steepness.ptr());
             kernels
@@ -574,16 +600,18 @@ impl Field {
         let (n, m) = (pass.buffers.n, pass.chunk.len() as u64);
         let (begin, end) = (pass.chunk.start, pass.chunk.end);
         let coordinates = u64::from(self.shape.coordinate_inputs());
-        let d_inputs = pass.scratch.d_inputs.ptr();
         let points = pass.points;
-        let (d_features, slopes, d_gradient) = match &pass.buffers.slope {
+        let mut d_features = pass.scratch.d_inputs.ptr();
+        if self.shape.gradient || self.by_matrices {
+            d_features = d_features.offset(coordinates * m);
+        }
+        let (slopes, d_gradient) = match &pass.buffers.slope {
             Some(slope) => (
-                d_inputs.offset(coordinates * m),
                 slope.slopes.ptr().offset(coordinates * u64::from(n)),
                 slope.d_gradient.ptr(),
             ),
-            // Nobody reads the last two.
-            None => (d_inputs, points, points),
+            // Nobody reads them.
+            None => (points, points),
         };
         let d_table = pass.params.d_value(self.table);
         let levels = self.levels.ptr();
@@ -650,4 +678,16 @@ impl Field {
         let kernels = self.by_chain_rule.as_ref();
         kernels.expect("a field that was built with a gradient")
     }
+}
+
+/// Work of a network's kernel over `points`, each with so many operations and bytes.
+fn work_of<A>(kernel: &Kernel<A>, points: usize, flops: f64, bytes: f64) -> Work {
+    let (work, share) = match kernel.matrix_tile() {
+        Some([_, columns]) => {
+            let groups = points.div_ceil(columns as usize);
+            (Work::groups(groups as u64), f64::from(columns))
+        }
+        None => (Work::items(points as u64), 1.0),
+    };
+    work.flops(flops * share).bytes(bytes * share)
 }

@@ -8,7 +8,7 @@ use crate::gpu::{Buffer, DeviceKind, Gpu, Kernel, KernelShape, Matrices, Recorde
 /// How one product is computed: by cooperative matrices where it is wide, otherwise with so many channels per invocation.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Form {
-    by_matrices: bool,
+    matrices: Matrices,
     tile: u32,
 }
 
@@ -25,21 +25,23 @@ const WIDE: u32 = 32;
 impl Form {
     const fn tiles(tile: u32) -> Form {
         Form {
-            by_matrices: false,
+            matrices: Matrices::Off,
             tile,
         }
     }
 
-    fn matrices(self) -> Form {
-        Form {
-            by_matrices: true,
-            ..self
-        }
+    fn by(self, matrices: Matrices) -> Form {
+        Form { matrices, ..self }
     }
 
     /// Channels per invocation where there are so many at all; what cooperative matrices take, [`Kernel::matrix_tile`] says.
     pub fn tile(&self, channels: u32) -> u32 {
         self.tile.min(channels)
+    }
+
+    /// Whether a product of this size is computed by cooperative matrices.
+    pub fn by_matrices(&self, size: [u32; 2]) -> bool {
+        self.matrices.is_demanded() && size.iter().all(|&size| size >= WIDE)
     }
 
     /// The kernel of a product of this size.
@@ -49,9 +51,8 @@ impl Form {
         size: [u32; 2],
         shape: S,
     ) -> Result<Kernel<S::Args>> {
-        let wide = size.iter().all(|&size| size >= WIDE);
-        match self.by_matrices && wide {
-            true => gpu.matrix_kernel(shape),
+        match self.by_matrices(size) {
+            true => gpu.matrix_kernel(shape, self.matrices == Matrices::Compensated),
             false => gpu.kernel(shape),
         }
     }
@@ -59,7 +60,7 @@ impl Form {
 
 impl std::fmt::Display for Form {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        match self.by_matrices {
+        match self.matrices.is_demanded() {
             true => f.write_str("matrices"),
             false => write!(f, "tiles of {}", self.tile),
         }
@@ -78,16 +79,16 @@ impl Forms {
         let (wanted, info) = (gpu.options().matrices, gpu.info());
         if wanted.is_demanded() {
             return Ok(Forms {
-                linear: usual.linear.matrices(),
-                gradient: usual.gradient.matrices(),
+                linear: usual.linear.by(wanted),
+                gradient: usual.gradient.by(wanted),
             });
         }
         let mut linear = [16, 8, 32].map(Form::tiles).to_vec();
         let mut gradient = [32, 16].map(Form::tiles).to_vec();
         // Software devices imitate matrices, several times slower than what they do without.
         if wanted == Matrices::Auto && info.matrix.is_some() && info.kind != DeviceKind::Cpu {
-            linear.push(usual.linear.matrices());
-            gradient.push(usual.gradient.matrices());
+            linear.push(usual.linear.by(Matrices::Compensated));
+            gradient.push(usual.gradient.by(Matrices::Compensated));
         }
         let with_linear = |linear| Forms { linear, ..usual };
         let with_gradient = |gradient| Forms { gradient, ..usual };

@@ -32,7 +32,10 @@ fn unsettled(mut command: Command, words: &[&str]) -> Command {
     command
         .env_remove("RUST_LOG")
         .env_remove("RUST_BACKTRACE")
-        .env("NEURODIN_CACHE", concat!(env!("CARGO_TARGET_TMPDIR"), "/cache"))
+        .env(
+            "NEURODIN_CACHE",
+            concat!(env!("CARGO_TARGET_TMPDIR"), "/cache"),
+        )
         .args(words);
     command
 }

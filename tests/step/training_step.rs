@@ -120,7 +120,7 @@ fn by_the_portable_kernels() -> Result<()> {
     check(preset("outdoor-tiny"), RegionShape::Sphere, 9, true)
 }
 
-/// Layers are 64 wide here, and the matrices' operands keep what float16 drops: the bar is that of float32.
+/// Networks and layers are wide enough for them, and the matrices' operands keep what float16 drops: the bar is that of float32.
 #[test]
 fn both_stages_by_compensated_matrices() -> Result<()> {
     let wanted = GpuOptions {
@@ -133,6 +133,8 @@ fn both_stages_by_compensated_matrices() -> Result<()> {
     }
     for mut config in [preset("outdoor-tiny"), second("outdoor-tiny")] {
         config.matrices = Matrices::Compensated;
+        config.hash.features = 4;
+        config.hash.log2_size = 14;
         check(config, RegionShape::Sphere, 9, false)?;
     }
     Ok(())
