@@ -658,20 +658,20 @@ mod tests {
     #[test]
     fn steps_are_shared_by_the_stages() {
         let tiny = Config::preset("outdoor-tiny").unwrap();
-        assert_eq!((tiny.steps, tiny.stage2.steps), (10_000, 10_000));
+        assert_eq!((tiny.steps, tiny.stage2.steps), (9000, 3000));
         let both = tiny.with_total_steps(2001);
         assert_eq!(
             (both.steps, both.stage2.steps, both.total_steps()),
-            (1001, 1000, 2001)
+            (1501, 500, 2001)
         );
         let second = both.second_stage().unwrap();
         assert_eq!(
             (second.first_step, second.steps, second.stage2.steps),
-            (1001, 1000, 0)
+            (1501, 500, 0)
         );
         assert_eq!(second.total_steps(), 2001);
         // Lengthened when it has begun, only what is left of it can be.
-        assert_eq!(second.with_total_steps(3001).steps, 2000);
+        assert_eq!(second.with_total_steps(3001).steps, 1500);
         let mut first_only = both;
         first_only.stage2.steps = 0;
         assert_eq!(first_only.with_total_steps(70).steps, 70);

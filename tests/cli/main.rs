@@ -475,8 +475,8 @@ fn a_run_from_photographs_to_mesh() {
     );
     assert_eq!(dry.code, Some(0), "{}", dry.stderr);
     let result: Value = serde_json::from_str(&dry.stdout).unwrap();
-    assert_eq!(result["config"]["steps"], 6);
-    assert_eq!(result["config"]["stage2"]["steps"], 6);
+    assert_eq!(result["config"]["steps"], 9);
+    assert_eq!(result["config"]["stage2"]["steps"], 3);
     assert!(!root.join("run").exists());
 
     let whole = said(
@@ -522,11 +522,7 @@ fn a_run_from_photographs_to_mesh() {
     assert!(!refused.contains("panic"), "{refused}");
     let longer = run(&["train", "--out", &out, "--resume", "--steps", "16"]);
     assert_eq!(longer.code, Some(0), "{}", longer.stderr);
-    assert!(
-        longer.stderr.contains("steps: 6 -> 10"),
-        "{}",
-        longer.stderr
-    );
+    assert!(longer.stderr.contains("steps: 3 -> 7"), "{}", longer.stderr);
     assert_eq!(logged(&run_folder, "resumed")[0]["step"], 12);
 
     // A damaged checkpoint is refused, and the one before taken.

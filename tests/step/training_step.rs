@@ -22,12 +22,10 @@ use std::collections::BTreeMap;
 const STEP: u64 = 4;
 
 fn preset(name: &str) -> Config {
-    let preset = Config::preset(name).expect("a preset");
-    Config {
-        steps: 40,
-        rays: 40,
-        ..preset
-    }
+    let mut preset = Config::preset(name).expect("a preset");
+    (preset.steps, preset.stage2.steps) = (40, 10_000);
+    preset.rays = 40;
+    preset
 }
 
 #[test]
