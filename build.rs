@@ -458,6 +458,18 @@ fn kernel_module(stem: &str, source: &Source, module: &Module, cooperative: &str
         true => format!("Some({})", embed(DETERMINISTIC)),
         false => "None".into(),
     };
+    let size = |name: &str| {
+        let mut constants = module.constants.iter();
+        let constant = constants.find(|constant| constant.name == name);
+        constant.map_or("0".into(), |constant| value_text(constant.default))
+    };
+    let matrix_tile = match module.cooperative {
+        true => format!(
+            "Some([{}])",
+            ["TILE_M", "TILE_N", "TILE_K"].map(size).join(", ")
+        ),
+        false => "None".into(),
+    };
     let mut pointers = String::new();
     for field in &module.args {
         if let Type::Pointer { writable, .. } = field.ty {
@@ -470,7 +482,7 @@ fn kernel_module(stem: &str, source: &Source, module: &Module, cooperative: &str
     }
     format!(
         "crate::gpu::KernelModule {{ name: {stem:?}, local_size: {:?}, spirv: {}, spirv_of_core: {fallback}, \
-         deterministic_spirv: {deterministic}, cooperative: {cooperative}, pointers: &[{pointers}], indirect_reads: {}, \
+         deterministic_spirv: {deterministic}, cooperative: {cooperative}, matrix_tile: {matrix_tile}, pointers: &[{pointers}], indirect_reads: {}, \
          indirect_writes: {} }}",
         module.local_size,
         embed(""),

@@ -20,7 +20,7 @@ layout(push_constant, scalar) uniform Args {
     SumsMut d_bias;    // [OUTPUTS] accumulated
     uint n;
     uint stride_x;     // samples between channels of x (x may be the front part of a longer buffer)
-    uint chunk;        // samples per workgroup
+    uint chunk;        // samples per workgroup, a multiple of TILE_K
 };
 
 const uint TILES = (INPUTS + TILE_N - 1u) / TILE_N;

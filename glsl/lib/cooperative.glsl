@@ -4,6 +4,7 @@
 // features overflow. COMPENSATED keeps what float16 drops as a second float16, and adds the products of each with the other's first: what
 // is neglected is 2⁻²² of the chunk's largest number, and the product is float32's but for its last digits.
 // The including kernel says what A and B are; what its own constants say comes first, so this is included after them.
+
 // What the device multiplies: M × K by K × N. (Validation layers of 2025 look at the defaults alone: these are lavapipe's.)
 layout(constant_id = 100) const uint MATRIX_M = 8;
 layout(constant_id = 101) const uint MATRIX_N = 8;
@@ -11,7 +12,10 @@ layout(constant_id = 102) const uint MATRIX_K = 8;
 layout(constant_id = 103) const uint SUBGROUP = 8;  // invocations of a subgroup
 layout(constant_id = 104) const uint COMPENSATED = 1;
 
-const uint TILE_M = 64, TILE_N = 64, TILE_K = 32;
+// Rows and columns of C per workgroup, and what of k is in shared memory at once; build.rs reads the three here.
+layout(constant_id = 105) const uint TILE_M = 64;
+layout(constant_id = 106) const uint TILE_N = 64;
+layout(constant_id = 107) const uint TILE_K = 32;
 const uint SUBGROUPS = LOCAL_SIZE / SUBGROUP;
 const uint COLUMNS = TILE_N / MATRIX_N;
 const uint ROWS = TILE_M / MATRIX_M;

@@ -381,12 +381,14 @@ impl Instance {
         let offered =
             offered.map_err(vulkan("vkGetPhysicalDeviceCooperativeMatrixPropertiesKHR"))?;
         let (half, single) = (vk::ComponentTypeKHR::FLOAT16, vk::ComponentTypeKHR::FLOAT32);
+        let tiles =
+            (crate::kernels::ALL.iter()).filter_map(|module| module.cooperative?.matrix_tile);
         let usable = offered.iter().filter(|p| {
             (p.a_type, p.b_type, p.c_type, p.result_type) == (half, half, single, single)
                 && p.scope == vk::ScopeKHR::SUBGROUP
-                && [(p.m_size, 64), (p.n_size, 64), (p.k_size, 32)]
-                    .iter()
-                    .all(|(size, tile)| tile % size == 0)
+                && tiles
+                    .clone()
+                    .all(|[m, n, k]| m % p.m_size == 0 && n % p.n_size == 0 && k % p.k_size == 0)
                 && p.m_size.max(p.n_size) <= subgroup
         });
         let sizes = usable.map(|p| [p.m_size, p.n_size, p.k_size]);

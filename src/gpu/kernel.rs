@@ -24,17 +24,14 @@ pub struct KernelModule {
     pub deterministic_spirv: Option<&'static [u8]>,
     /// The same by cooperative matrices, with the same arguments and constants, where the kernel has such a form.
     pub cooperative: Option<&'static KernelModule>,
+    /// Where the kernel multiplies by cooperative matrices: rows and columns of the product that a workgroup computes, and what of the sum
+    /// it has in shared memory at once.
+    pub matrix_tile: Option<[u32; 3]>,
     /// The pointers in the push-constant block.
     pub pointers: &'static [PointerArg],
     /// Whether it reads, or writes, through pointers found elsewhere than in the block.
     pub indirect_reads: bool,
     pub indirect_writes: bool,
-}
-
-impl KernelModule {
-    fn is_cooperative(&self) -> bool {
-        self.name.ends_with(".cooperative")
-    }
 }
 
 /// A pointer in a push-constant block.
@@ -105,7 +102,9 @@ impl<A> Kernel<A> {
 
     /// Rows and columns of the product that a workgroup computes, where it does so by cooperative matrices (glsl/lib/cooperative.glsl).
     pub fn matrix_tile(&self) -> Option<[u32; 2]> {
-        self.module.is_cooperative().then_some([64, 64])
+        self.module
+            .matrix_tile
+            .map(|[rows, columns, _]| [rows, columns])
     }
 }
 
@@ -204,7 +203,7 @@ impl Pipelines {
             _ => module.spirv,
         };
         let mut constants = constants.to_vec();
-        if module.is_cooperative() {
+        if module.matrix_tile.is_some() {
             constants.extend(&self.matrix_constants);
         }
         let words: Vec<u32> = bytemuck::pod_collect_to_vec(spirv);
@@ -230,7 +229,7 @@ impl Pipelines {
         let mut size = vk::PipelineShaderStageRequiredSubgroupSizeCreateInfo::default()
             .required_subgroup_size(info.subgroup_size);
         let flags = match info.full_subgroups {
-            _ if module.is_cooperative() => {
+            _ if module.matrix_tile.is_some() => {
                 vk::PipelineShaderStageCreateFlags::REQUIRE_FULL_SUBGROUPS
             }
             Some((_, largest)) if module.local_size[0].is_multiple_of(largest) => {
@@ -245,7 +244,7 @@ impl Pipelines {
             .module(shader)
             .name(c"main")
             .specialization_info(&specialization);
-        if module.is_cooperative() {
+        if module.matrix_tile.is_some() {
             stage = stage.push_next(&mut size);
         }
         let create = [vk::ComputePipelineCreateInfo::default()
