@@ -8,6 +8,7 @@ mod lazy_table;
 mod optimizer;
 mod volume_compositing;
 mod volume_golden;
+mod volume_grazing;
 mod volume_losses;
 mod volume_rays;
 mod volume_sampling;
