@@ -1,11 +1,13 @@
 #version 460
-// Brings every entry of the hash table up to date, for whoever reads all of it, one parameter of a level (the slice) per invocation.
+// Brings every entry of the hash table up to date, for whoever reads all of it, one pair of an entry's parameters per invocation;
+// the level is the slice.
 // Stamps and marks are the caller's to clear.
 #include "lib/prelude.glsl"
 #include "lib/hash_grid.glsl"
 #include "lib/lazy_table.glsl"
 
 layout(constant_id = 0) const uint FEATURES = 2;
+#include "lib/entry.glsl"
 
 layout(push_constant, scalar) uniform Args {
     Levels levels;
@@ -23,18 +25,20 @@ layout(push_constant, scalar) uniform Args {
 };
 
 void main() {
-    uint l = slice();
+    uint l = slice(), k = item() % PAIRS, in_level = item() / PAIRS;
     Level level = levels.at[l];
-    if (item() >= level.entries * FEATURES || uses.at[l].whole != 0u) return;
-    uint i = level.offset * FEATURES + item();
-    uint slot = first_slot(level, l) + item() / FEATURES;
+    if (in_level >= level.entries || uses.at[l].whole != 0u) return;
+    uint entry = level.offset + in_level, slot = first_slot(level, l) + in_level;
     uint now = clock.at[0];
     uint stamp = stamp_in(stamps.at[slot >> 2u], slot);
     if (stamp == now) return;
-    Moving x = Moving(table.at[i], first_moment.at[i], second_moment.at[i]);
+    Moving x = Moving(load_features(reading(table), entry, k), load_features(reading(first_moment), entry, k),
+                      load_features(reading(second_moment), entry, k));
     bool marked = (marks.at[slot >> 5u] >> (slot & 31u) & 1u) != 0u;
     Lag lag = lags.at[stamp];
-    if (!marked) table.at[i] = caught_up(x, lag, lags, stamp, now, Rates(0.0, 0.0, 1.0, share1, share2, epsilon));
-    first_moment.at[i] = lag.first * x.m;
-    second_moment.at[i] = lag.second * x.v;
+    if (!marked) {
+        store_features(table, entry, k, caught_up(x, lag, lags, stamp, now, Rates(0.0, 0.0, 1.0, share1, share2, epsilon)));
+    }
+    store_features(first_moment, entry, k, lag.first * x.m);
+    store_features(second_moment, entry, k, lag.second * x.v);
 }

@@ -47,11 +47,9 @@ void main() {
         if (stamp == now) continue;
         Lag lag = lags.at[stamp];
         [[unroll]] for (uint k = 0u; k < PAIRS; ++k) {
-            vec2 p = load_features(reading(table), entry, k);
-            vec2 m = load_features(first_moment, entry, k);
-            vec2 v = load_features(second_moment, entry, k);
-            [[unroll]] for (uint f = 0u; f < 2u; ++f) p[f] = caught_up(Moving(p[f], m[f], v[f]), lag, lags, stamp, now, rates);
-            store_features(table, entry, k, p);
+            Moving x = Moving(load_features(reading(table), entry, k), load_features(first_moment, entry, k),
+                              load_features(second_moment, entry, k));
+            store_features(table, entry, k, caught_up(x, lag, lags, stamp, now, rates));
         }
     }
     touched = subgroupAdd(touched);

@@ -44,24 +44,17 @@ void update_stale(uint entry, uint slot, bool marked) {
     Lag lag = NO_LAG;
     if (stamp != now) lag = lags.at[stamp];
     [[unroll]] for (uint k = 0u; k < PAIRS; ++k) {
-        vec2 p = load_features(reading(table), entry, k);
+        Moving x = Moving(load_features(reading(table), entry, k), load_features(reading(first_moment), entry, k),
+                          load_features(reading(second_moment), entry, k));
         vec2 g = load_sums(grads, entry, k);
-        vec2 m = load_features(reading(first_moment), entry, k);
-        vec2 v = load_features(reading(second_moment), entry, k);
-        [[unroll]] for (uint f = 0u; f < 2u; ++f) {
-            Moving x = Moving(p[f], m[f], v[f]);
-            if (!marked) x.p = caught_up(x, lag, lags, stamp, now, rates);
-            x.m *= lag.first;
-            x.v *= lag.second;
-            if (!bad) x = adam_step(x, g[f], rates);
-            p[f] = x.p;
-            m[f] = x.m;
-            v[f] = x.v;
-        }
+        if (!marked) x.p = caught_up(x, lag, lags, stamp, now, rates);
+        x.m *= lag.first;
+        x.v *= lag.second;
+        if (!bad) x = adam_step(x, g, rates);
         if (marked) clear_sums(grads, entry, k);
-        store_features(table, entry, k, p);
-        store_features(first_moment, entry, k, m);
-        store_features(second_moment, entry, k, v);
+        store_features(table, entry, k, x.p);
+        store_features(first_moment, entry, k, x.m);
+        store_features(second_moment, entry, k, x.v);
     }
     stamps.at[slot >> 2u] ^= (stamp ^ next) << (8u * (slot & 3u));
 }

@@ -44,19 +44,20 @@ uint stamp_in(uint word, uint slot) { return (word >> (8u * (slot & 3u))) & 255u
 const Lag NO_LAG = Lag(0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 1.0);
 
 // p of an entry that stands at `stamp`, with its row, as it should be at `now`.
-float caught_up(Moving x, Lag lag, Lags lags, uint stamp, uint now, Rates r) {
+vec2 caught_up(Moving x, Lag lag, Lags lags, uint stamp, uint now, Rates r) {
     float slowing = r.epsilon * lag.slowing;
-    float inverse = 1.0 / max(sqrt(x.v) + slowing, 1e-37);
-    float moved = lag.momentum * x.m * inverse;
+    vec2 inverse = 1.0 / max(sqrt(x.v) + slowing, 1e-37);
+    vec2 moved = lag.momentum * x.m * inverse;
     // The mean b stands for all b_j as long as ε is small. What is neglected is (ε b/(√v + ε b))² of the move, times the relative variance
     // of the b_j: a tenth, if both the first steps and the longest lags are in it. Where that could matter: step by step.
-    float small = slowing * inverse;
-    if (abs(moved) * small * small > 2e-7) {
+    vec2 small = slowing * inverse;
+    vec2 neglected = abs(moved) * small * small;
+    if (max(neglected.x, neglected.y) > 2e-7) {
         for (uint k = stamp; k != now; k = (k + 1u) % READINGS) {
             Lag next = lags.at[(k + 1u) % READINGS];
-            x = adam_step(x, 0.0, Rates(next.step_rate, next.step_decay, next.step_correction, r.share1, r.share2, r.epsilon));
+            x = adam_step(x, vec2(0.0), Rates(next.step_rate, next.step_decay, next.step_correction, r.share1, r.share2, r.epsilon));
         }
         return x.p;
     }
-    return x.p - fma(lag.decay, x.p, moved);
+    return x.p - fma(vec2(lag.decay), x.p, moved);
 }

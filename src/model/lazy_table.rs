@@ -255,8 +255,9 @@ impl LazyTable {
             share2: self.share2,
             epsilon: self.epsilon,
         };
-        let work = Work::items(self.most_entries * u64::from(self.features)).slices(self.n_levels);
-        rec.run(&self.catch_up, work.flops(10.0).bytes(24.0), args);
+        let pairs = u64::from(self.features.div_ceil(2));
+        let work = Work::items(self.most_entries * pairs).slices(self.n_levels);
+        rec.run(&self.catch_up, work.flops(20.0).bytes(48.0), args);
         self.reset(rec);
     }
 
