@@ -54,7 +54,8 @@ impl Model {
         let background = Background::new(gpu, config, &mut plan, n_views, sky)?;
         let table = match learns {
             true => {
-                let points = config.rays * config.sampling.samples * surface.blocks();
+                let beside = u32::from(config.loss.tangent > 0.0);
+                let points = config.rays * config.sampling.samples * (surface.blocks() + beside);
                 let (grid, table) = (&surface.field.shape.grid, surface.field.table());
                 LazyTable::new(gpu, grid, table, &config.optimizer, points)?
             }
