@@ -69,6 +69,7 @@ void main() {
                     s_dot[t] = fma(hidden_weight.at[(first_neuron + t) * INPUTS + i], z_dot[i], s_dot[t]);
             }
         }
+        float d_w2_of_lane = 0.0;
         [[unroll]] for (uint t = 0u; t < TILE; ++t) {
             uint neuron = first_neuron + t;
             float w2 = head_weight.at[neuron];
@@ -84,8 +85,13 @@ void main() {
             }
             u[t] = inside ? d_u : 0.0;
             if (inside) d_preactivation.at[neuron * m + q] = u[t];
+            // A lane for each neuron's sum, so that one access adds as many as there are lanes.
             d_w2 = subgroupAdd(d_w2);
-            if (subgroupElect()) add(d_head_weight, neuron, d_w2);
+            uint lane = t % gl_SubgroupSize;
+            if (gl_SubgroupInvocationID == lane) d_w2_of_lane = d_w2;
+            if (lane == gl_SubgroupSize - 1u || t == TILE - 1u) {
+                if (gl_SubgroupInvocationID <= lane) add(d_head_weight, neuron - lane + gl_SubgroupInvocationID, d_w2_of_lane);
+            }
         }
         [[unroll]] for (uint i = 0u; i < OUT_INPUTS; ++i) {
             [[unroll]] for (uint t = 0u; t < TILE; ++t)
