@@ -39,8 +39,9 @@ const uint TANGENTS = SECOND_ORDER != 0u ? INPUTS : 1u;
 
 void main() {
     uint point = begin + item();
-    // Invocations past the end stay for the subgroup's sums and add nothing. (Summing up in shared memory first would halve the speed on
-    // software devices, where a barrier costs more than an atomic add.)
+    // Invocations past the end stay for the subgroup's sums, to which they add nothing; they do the first point once more, and write what
+    // its own invocation writes: a software device pays as much for a question around a store as for the store. (Summing up in shared
+    // memory first would halve its speed, too: a barrier costs more there than an atomic add.)
     bool inside = point < end;
     uint p = inside ? point : begin;
     uint q = p - first;
@@ -48,10 +49,10 @@ void main() {
     [[unroll]] for (uint i = 0u; i < INPUTS; ++i) z[i] = inputs.at[i * n + p];
     float z_dot[TANGENTS];
     if (SECOND_ORDER != 0u) {
-        [[unroll]] for (uint i = 0u; i < TANGENTS; ++i) z_dot[i] = inside ? tangents.at[i * m + q] : 0.0;
+        [[unroll]] for (uint i = 0u; i < TANGENTS; ++i) z_dot[i] = tangents.at[i * m + q];
     }
-    float d_out = inside ? d_first.at[p] : 0.0;
-    bool has_heads = HEADS != 0u && inside && point < n_hidden;
+    float d_out = d_first.at[p];
+    bool has_heads = HEADS != 0u && p < n_hidden;
     float d_z[OUT_INPUTS];
     [[unroll]] for (uint i = 0u; i < OUT_INPUTS; ++i) d_z[i] = 0.0;
 
@@ -81,12 +82,12 @@ void main() {
             if (SECOND_ORDER != 0u) {
                 d_w2 += s_dot[t] * slope;
                 d_u += s_dot[t] * w2 * activation_curvature(slope);
-                if (inside) steepness.at[neuron * m + q] = slope * w2;
+                steepness.at[neuron * m + q] = slope * w2;
             }
-            u[t] = inside ? d_u : 0.0;
-            if (inside) d_preactivation.at[neuron * m + q] = u[t];
+            u[t] = d_u;
+            d_preactivation.at[neuron * m + q] = d_u;
             // A lane for each neuron's sum, so that one access adds as many as there are lanes.
-            d_w2 = subgroupAdd(d_w2);
+            d_w2 = subgroupAdd(inside ? d_w2 : 0.0);
             uint lane = t % gl_SubgroupSize;
             if (gl_SubgroupInvocationID == lane) d_w2_of_lane = d_w2;
             if (lane == gl_SubgroupSize - 1u || t == TILE - 1u) {
@@ -98,11 +99,9 @@ void main() {
                 d_z[i] = fma(hidden_weight.at[(first_neuron + t) * INPUTS + FIRST_INPUT + i], u[t], d_z[i]);
         }
     }
-    if (inside) {
-        [[unroll]] for (uint i = 0u; i < OUT_INPUTS; ++i) d_inputs.at[i * m + q] = d_z[i];
-    }
+    [[unroll]] for (uint i = 0u; i < OUT_INPUTS; ++i) d_inputs.at[i * m + q] = d_z[i];
     if (BIAS != 0u) {
-        float d_b2 = subgroupAdd(d_out);
+        float d_b2 = subgroupAdd(inside ? d_out : 0.0);
         if (subgroupElect()) add(d_head_bias, 0u, d_b2);
     }
 }

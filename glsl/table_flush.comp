@@ -1,7 +1,6 @@
 #version 460
 // Brings every entry of the hash table up to date, for whoever reads all of it, one pair of an entry's parameters per invocation;
-// the level is the slice.
-// Stamps and marks are the caller's to clear.
+// the level is the slice. Stamps and marks are the caller's to clear.
 #include "lib/prelude.glsl"
 #include "lib/hash_grid.glsl"
 #include "lib/lazy_table.glsl"

@@ -1,6 +1,7 @@
 #version 460
 // AdamW of the hash table: of the marked entries of a level (the slice), or of all where most are marked; levels that are up to date as
-// a whole are table_update_whole's. An invocation walks over the marks of a strip of entries. Gradients and marks are consumed in passing. A step whose loss is not finite changes nothing.
+// a whole are table_update_whole's. An invocation walks over the marks of a strip of entries. Gradients and marks are consumed in passing.
+// A step whose loss is not finite changes nothing.
 // Every strip is gone over as a whole once in so many steps, so that no entry is left alone for as long as stamps can count.
 #include "lib/prelude.glsl"
 #include "lib/hash_grid.glsl"
