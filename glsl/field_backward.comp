@@ -38,6 +38,12 @@ const uint OUT_INPUTS = INPUTS - FIRST_INPUT;
 const uint TANGENTS = SECOND_ORDER != 0u ? INPUTS : 1u;
 
 void main() {
+    // The loop's arguments are read before it: a software device asks at every reading whether the launch has so many, and where such a
+    // question stands the sums are torn from their products.
+    F32s hidden_weight = hidden_weight, hidden_bias = hidden_bias, head_weight = head_weight, d_hidden = d_hidden;
+    F32sMut d_preactivation = d_preactivation, steepness = steepness;
+    SumsMut d_head_weight = d_head_weight;
+    uint n_hidden = n_hidden, m = m;
     uint point = begin + item();
     // Invocations past the end stay for the subgroup's sums, to which they add nothing; they do the first point once more, and write what
     // its own invocation writes: a software device pays as much for a question around a store as for the store. (Summing up in shared
@@ -57,17 +63,18 @@ void main() {
     [[unroll]] for (uint i = 0u; i < OUT_INPUTS; ++i) d_z[i] = 0.0;
 
     for (uint first_neuron = 0u; first_neuron < HIDDEN; first_neuron += TILE) {
+        F32s weight = from(hidden_weight, first_neuron * INPUTS);
         float u[TILE];
         [[unroll]] for (uint t = 0u; t < TILE; ++t) u[t] = BIAS != 0u ? hidden_bias.at[first_neuron + t] : 0.0;
         [[unroll]] for (uint i = 0u; i < INPUTS; ++i) {
-            [[unroll]] for (uint t = 0u; t < TILE; ++t) u[t] = fma(hidden_weight.at[(first_neuron + t) * INPUTS + i], z[i], u[t]);
+            [[unroll]] for (uint t = 0u; t < TILE; ++t) u[t] = fma(weight.at[t * INPUTS + i], z[i], u[t]);
         }
         float s_dot[TILE];
         if (SECOND_ORDER != 0u) {
             [[unroll]] for (uint t = 0u; t < TILE; ++t) s_dot[t] = 0.0;
             [[unroll]] for (uint i = 0u; i < TANGENTS; ++i) {
                 [[unroll]] for (uint t = 0u; t < TILE; ++t)
-                    s_dot[t] = fma(hidden_weight.at[(first_neuron + t) * INPUTS + i], z_dot[i], s_dot[t]);
+                    s_dot[t] = fma(weight.at[t * INPUTS + i], z_dot[i], s_dot[t]);
             }
         }
         float d_w2_of_lane = 0.0;
@@ -96,7 +103,7 @@ void main() {
         }
         [[unroll]] for (uint i = 0u; i < OUT_INPUTS; ++i) {
             [[unroll]] for (uint t = 0u; t < TILE; ++t)
-                d_z[i] = fma(hidden_weight.at[(first_neuron + t) * INPUTS + FIRST_INPUT + i], u[t], d_z[i]);
+                d_z[i] = fma(weight.at[t * INPUTS + FIRST_INPUT + i], u[t], d_z[i]);
         }
     }
     [[unroll]] for (uint i = 0u; i < OUT_INPUTS; ++i) d_inputs.at[i * m + q] = d_z[i];

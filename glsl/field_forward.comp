@@ -54,17 +54,23 @@ void main() {
         }
     }
     if (PART == 1u) return;
+    // The loop's arguments are read before it: a software device asks at every reading whether the launch has so many, and where such a
+    // question stands the sums are torn from their products.
+    F32s hidden_weight = hidden_weight, hidden_bias = hidden_bias, head_weight = head_weight;
+    F32sMut hidden = hidden;
+    uint n_hidden = n_hidden;
     float z[INPUTS];
     [[unroll]] for (uint i = 0u; i < INPUTS; ++i) z[i] = inputs.at[i * n + point];
 
     float sum = BIAS != 0u ? head_bias.at[0] : 0.0;
     for (uint block = 0u; block < HIDDEN; block += BLOCK) {
+        F32s weight = from(hidden_weight, block * INPUTS);
         [[unroll]] for (uint tile = 0u; tile < BLOCK; tile += TILE) {
             uint first_neuron = block + tile;
             float u[TILE];
             [[unroll]] for (uint t = 0u; t < TILE; ++t) u[t] = BIAS != 0u ? hidden_bias.at[first_neuron + t] : 0.0;
             [[unroll]] for (uint i = 0u; i < INPUTS; ++i) {
-                [[unroll]] for (uint t = 0u; t < TILE; ++t) u[t] = fma(hidden_weight.at[(first_neuron + t) * INPUTS + i], z[i], u[t]);
+                [[unroll]] for (uint t = 0u; t < TILE; ++t) u[t] = fma(weight.at[(tile + t) * INPUTS + i], z[i], u[t]);
             }
             [[unroll]] for (uint t = 0u; t < TILE; ++t) {
                 float h = activation(u[t]);

@@ -27,14 +27,15 @@ void main() {
     float a[INPUTS];
     [[unroll]] for (uint i = 0u; i < INPUTS; ++i) a[i] = 0.0;
     for (uint first_neuron = 0u; first_neuron < HIDDEN; first_neuron += TILE) {
+        F32s weight = from(hidden_weight, first_neuron * INPUTS);
         float u[TILE];
         [[unroll]] for (uint t = 0u; t < TILE; ++t) u[t] = BIAS != 0u ? hidden_bias.at[first_neuron + t] : 0.0;
         [[unroll]] for (uint i = 0u; i < INPUTS; ++i) {
-            [[unroll]] for (uint t = 0u; t < TILE; ++t) u[t] = fma(hidden_weight.at[(first_neuron + t) * INPUTS + i], z[i], u[t]);
+            [[unroll]] for (uint t = 0u; t < TILE; ++t) u[t] = fma(weight.at[t * INPUTS + i], z[i], u[t]);
         }
         [[unroll]] for (uint t = 0u; t < TILE; ++t) u[t] = activation_derivative(u[t]) * head_weight.at[first_neuron + t];
         [[unroll]] for (uint i = 0u; i < INPUTS; ++i) {
-            [[unroll]] for (uint t = 0u; t < TILE; ++t) a[i] = fma(hidden_weight.at[(first_neuron + t) * INPUTS + i], u[t], a[i]);
+            [[unroll]] for (uint t = 0u; t < TILE; ++t) a[i] = fma(weight.at[t * INPUTS + i], u[t], a[i]);
         }
     }
     [[unroll]] for (uint i = 0u; i < INPUTS; ++i) slopes.at[i * n + point] = a[i];

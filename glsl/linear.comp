@@ -11,7 +11,7 @@ layout(constant_id = 4) const uint BIAS = 1;
 layout(constant_id = 5) const uint ACTIVATION = 0;       // 0 none, 1 ReLU, 2 sigmoid
 layout(constant_id = 6) const uint GATED = 0;            // multiply by 1[gate > 0]
 layout(constant_id = 7) const uint TILE = 16;
-const uint CHUNK = 8;                                    // inputs per turn of the rolled loop for wide layers
+const uint CHUNK = INPUTS <= 64u ? INPUTS : 8u;          // inputs that are written out one after the other
 #include "lib/linear.glsl"
 
 layout(push_constant, scalar) uniform Args {
@@ -23,31 +23,26 @@ layout(push_constant, scalar) uniform Args {
     uint n;
 };
 
+// What `count` inputs from i0 on add to the outputs from `first` on.
+void add_products(inout float sum[TILE], uint first, uint i0, const uint count, uint sample_) {
+    F32s block = from(weight, weight_index(first, i0));
+    [[unroll]] for (uint i = 0u; i < count; ++i) {
+        float value = x.at[(i0 + i) * n + sample_];
+        [[unroll]] for (uint t = 0u; t < TILE; ++t) sum[t] = fma(block.at[weight_index(t, i)], value, sum[t]);
+    }
+}
+
 void main() {
     uint sample_ = item();
     if (sample_ >= n) return;
-    uint first = slice() * TILE;
-    // The last tile may overhang: it recomputes the last channel there and stores nothing.
+    // The last tile begins where it still is a whole one, and does not store what the tile before it stores.
+    uint first = min(slice() * TILE, OUTPUTS - TILE);
     float sum[TILE];
-    [[unroll]] for (uint t = 0u; t < TILE; ++t) sum[t] = BIAS != 0u ? bias.at[min(first + t, OUTPUTS - 1u)] : 0.0;
-    if (INPUTS <= 64u) {
-        [[unroll]] for (uint i = 0u; i < min(INPUTS, 64u); ++i) {
-            float value = x.at[i * n + sample_];
-            [[unroll]] for (uint t = 0u; t < TILE; ++t)
-                sum[t] = fma(weight.at[weight_index(min(first + t, OUTPUTS - 1u), i)], value, sum[t]);
-        }
-    } else {
-        for (uint i0 = 0u; i0 < INPUTS; i0 += CHUNK) {
-            [[unroll]] for (uint c = 0u; c < CHUNK; ++c) {
-                uint i = min(i0 + c, INPUTS - 1u);
-                float value = i0 + c < INPUTS ? x.at[i * n + sample_] : 0.0;
-                [[unroll]] for (uint t = 0u; t < TILE; ++t)
-                    sum[t] = fma(weight.at[weight_index(min(first + t, OUTPUTS - 1u), i)], value, sum[t]);
-            }
-        }
-    }
+    [[unroll]] for (uint t = 0u; t < TILE; ++t) sum[t] = BIAS != 0u ? bias.at[first + t] : 0.0;
+    for (uint i0 = 0u; i0 + CHUNK <= INPUTS; i0 += CHUNK) add_products(sum, first, i0, CHUNK, sample_);
+    add_products(sum, first, INPUTS / CHUNK * CHUNK, INPUTS % CHUNK, sample_);
     [[unroll]] for (uint t = 0u; t < TILE; ++t) {
-        if (first + t < OUTPUTS) {
+        if (OUTPUTS % TILE == 0u || first + t >= slice() * TILE) {
             float value = activated(sum[t]);
             uint at = (first + t) * n + sample_;
             if (GATED != 0u && !(gate.at[at] > 0.0)) value = 0.0;

@@ -10,6 +10,7 @@ layout(constant_id = 1) const uint OUTPUTS = 64;
 layout(constant_id = 2) const uint BIAS = 1;
 layout(constant_id = 3) const uint TILE = 32;
 const uint SAMPLES = 4u;  // per turn of the loop
+const uint TILES = (INPUTS + TILE - 1u) / TILE;
 
 layout(push_constant, scalar) uniform Args {
     F32s x;            // [INPUTS, n]
@@ -21,28 +22,31 @@ layout(push_constant, scalar) uniform Args {
     uint chunk;        // samples per workgroup
 };
 
+// What `count` samples from s0 on add to the weights of output o from input i0 on.
+void add_products(inout float sum[TILE], inout float bias, uint o, uint i0, uint s0, const uint count) {
+    float d[SAMPLES];
+    [[unroll]] for (uint k = 0u; k < count; ++k) {
+        d[k] = d_y.at[o * n + s0 + k];
+        bias += d[k];
+    }
+    [[unroll]] for (uint t = 0u; t < TILE; ++t) {
+        F32s samples = from(x, min(i0 + t, INPUTS - 1u) * stride_x + s0);
+        [[unroll]] for (uint k = 0u; k < count; ++k) sum[t] = fma(d[k], samples.at[k], sum[t]);
+    }
+}
+
 void main() {
-    const uint TILES = (INPUTS + TILE - 1u) / TILE;
     uint o = slice() / TILES * gl_WorkGroupSize.x + gl_LocalInvocationID.x;
     uint i0 = slice() % TILES * TILE;
     if (o >= OUTPUTS) return;
-    uint first = group() * chunk;
-    uint end = min(first + chunk, n);
+    uint s0 = group() * chunk;
+    uint end = min(s0 + chunk, n);
 
     float sum[TILE];
     [[unroll]] for (uint t = 0u; t < TILE; ++t) sum[t] = 0.0;
     float bias = 0.0;
-    for (uint s0 = first; s0 < end; s0 += SAMPLES) {
-        float d[SAMPLES];
-        [[unroll]] for (uint k = 0u; k < SAMPLES; ++k) {
-            d[k] = s0 + k < end ? d_y.at[o * n + min(s0 + k, n - 1u)] : 0.0;
-            bias += d[k];
-        }
-        [[unroll]] for (uint t = 0u; t < TILE; ++t) {
-            uint row = min(i0 + t, INPUTS - 1u) * stride_x;
-            [[unroll]] for (uint k = 0u; k < SAMPLES; ++k) sum[t] = fma(d[k], x.at[row + min(s0 + k, n - 1u)], sum[t]);
-        }
-    }
+    for (; s0 + SAMPLES <= end; s0 += SAMPLES) add_products(sum, bias, o, i0, s0, SAMPLES);
+    for (; s0 < end; ++s0) add_products(sum, bias, o, i0, s0, 1u);
     [[unroll]] for (uint t = 0u; t < TILE; ++t) {
         if (i0 + t < INPUTS) add(d_weight, o * INPUTS + i0 + t, sum[t]);
     }

@@ -30,6 +30,21 @@ layout(buffer_reference, scalar, buffer_reference_align = 4) buffer U32sMut { ui
 // What is only read, of what may be written.
 F32s reading(F32sMut p) { return F32s(uvec2(p)); }
 
+// The array from index i on. What is read there at constant indices needs no arithmetic for its addresses: a software device would keep
+// each of them on its stack.
+#ifdef CORE_ONLY
+F32s from(F32s p, uint i) {
+    uvec2 address = uvec2(p), bytes;
+    uint carry;
+    umulExtended(4u, i, bytes.y, bytes.x);
+    address.x = uaddCarry(address.x, bytes.x, carry);
+    address.y += bytes.y + carry;
+    return F32s(address);
+}
+#else
+F32s from(F32s p, uint i) { return F32s(uint64_t(p) + 4ul * i); }
+#endif
+
 // Two neighbours from an even index on, in one access: software devices make one of each component of a vector.
 #ifdef CORE_ONLY
 vec2 pair_at(F32s p, uint i) { return vec2(p.at[i], p.at[i + 1u]); }
