@@ -24,11 +24,15 @@ struct Cell {
     vec3 weight;  // position inside the cell, in [0, 1)
 };
 
+// What a float without fraction says, up to ±2²²; beyond, some integer. With 3·2²² added its units are the last bit of the mantissa. (A
+// software device's own conversion takes lane by lane and asks whether each fits.)
+uvec3 integers(vec3 whole) { return floatBitsToUint(whole + 12582912.0) - floatBitsToUint(12582912.0); }
+
 Cell cell_of(Level level, vec3 x) {
     float half_scale = 0.5 * level.scale;
     vec3 low = floor(fma(vec3(half_scale), x, vec3(half_scale)) + 0.5);
     // The fraction is taken from the integer part, not from the rounded position: at 2000 cells that would cost 13 of its 24 bits.
-    return Cell(uvec3(ivec3(low)), fma(vec3(half_scale), x, half_scale - low) + 0.5);
+    return Cell(integers(low), fma(vec3(half_scale), x, half_scale - low) + 0.5);
 }
 
 const uvec3 HASH_PRIMES = uvec3(1u, 2654435761u, 805459861u);
