@@ -9,6 +9,7 @@ struct Level {
     uint entries;     // stored feature vectors; a power of two where hashed
     uint offset;      // first entry in the table
     uint hashed;      // 1: hashed, 0: dense
+    uint reciprocal;  // ⌊2³² / entries⌋
 };
 layout(buffer_reference, scalar) readonly buffer Levels { Level at[]; };
 
@@ -46,7 +47,11 @@ uint corner_entry(Level level, Cell cell, uint corner) {
         index = (h.x ^ h.y ^ h.z) & (level.entries - 1u);
     } else {
         index = at.x + level.resolution * (at.y + level.resolution * at.z);
-        if (index >= level.entries) index %= level.entries;
+        // index mod entries: a software device divides lane by lane. The reciprocal is at most one too small.
+        uint quotient, rest;
+        umulExtended(index, level.reciprocal, quotient, rest);
+        index -= quotient * level.entries;
+        if (index >= level.entries) index -= level.entries;
     }
     return level.offset + index;
 }

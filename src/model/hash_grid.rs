@@ -39,6 +39,7 @@ impl HashGrid {
                     entries: entries as u32,
                     offset,
                     hashed: u32::from(dense > entries),
+                    reciprocal: ((1 << 32) / entries) as u32,
                 };
                 offset += entries as u32;
                 level
