@@ -1,6 +1,7 @@
 #version 460
 // One layer of a network on planar activations: Y = σ(WX + b), or with TRANSPOSED its adjoint d_X = Wᵀd_Y, gated by the derivative
-// of the ReLU that made X. One sample and TILE output channels per invocation; the slice picks the channels.
+// of the ReLU that made X. One sample and TILE output channels per invocation, the slice picks the channels; or all tiles of a sample,
+// one after the other, in a launch of one slice.
 #include "lib/prelude.glsl"
 
 layout(constant_id = 0) const uint INPUTS = 64;
@@ -10,8 +11,10 @@ layout(constant_id = 3) const uint TRANSPOSED = 0;
 layout(constant_id = 4) const uint BIAS = 1;
 layout(constant_id = 5) const uint ACTIVATION = 0;       // 0 none, 1 ReLU, 2 sigmoid
 layout(constant_id = 6) const uint GATED = 0;            // multiply by 1[gate > 0]
-layout(constant_id = 7) const uint TILE = 16;
-const uint CHUNK = INPUTS <= 64u ? INPUTS : 8u;          // inputs that are written out one after the other
+layout(constant_id = 7) const uint TILE = 16;            // at most OUTPUTS
+layout(constant_id = 8) const uint HELD = 0;             // an invocation holds its inputs, for all of its tiles
+const uint TILES = (OUTPUTS + TILE - 1u) / TILE;
+const uint CHUNK = HELD != 0u ? INPUTS : 8u;             // inputs that are written out one after the other
 #include "lib/linear.glsl"
 
 layout(push_constant, scalar) uniform Args {
@@ -23,11 +26,13 @@ layout(push_constant, scalar) uniform Args {
     uint n;
 };
 
+float held[HELD != 0u ? INPUTS : 1u];
+
 // What `count` inputs from i0 on add to the outputs from `first` on.
 void add_products(inout float sum[TILE], uint first, uint i0, const uint count, uint sample_) {
     F32s block = from(weight, weight_index(first, i0));
     [[unroll]] for (uint i = 0u; i < count; ++i) {
-        float value = x.at[(i0 + i) * n + sample_];
+        float value = HELD != 0u ? held[i] : x.at[(i0 + i) * n + sample_];
         [[unroll]] for (uint t = 0u; t < TILE; ++t) sum[t] = fma(block.at[weight_index(t, i)], value, sum[t]);
     }
 }
@@ -35,18 +40,26 @@ void add_products(inout float sum[TILE], uint first, uint i0, const uint count, 
 void main() {
     uint sample_ = item();
     if (sample_ >= n) return;
-    // The last tile begins where it still is a whole one, and does not store what the tile before it stores.
-    uint first = min(slice() * TILE, OUTPUTS - TILE);
-    float sum[TILE];
-    [[unroll]] for (uint t = 0u; t < TILE; ++t) sum[t] = BIAS != 0u ? bias.at[first + t] : 0.0;
-    for (uint i0 = 0u; i0 + CHUNK <= INPUTS; i0 += CHUNK) add_products(sum, first, i0, CHUNK, sample_);
-    add_products(sum, first, INPUTS / CHUNK * CHUNK, INPUTS % CHUNK, sample_);
-    [[unroll]] for (uint t = 0u; t < TILE; ++t) {
-        if (OUTPUTS % TILE == 0u || first + t >= slice() * TILE) {
-            float value = activated(sum[t]);
-            uint at = (first + t) * n + sample_;
-            if (GATED != 0u && !(gate.at[at] > 0.0)) value = 0.0;
-            y.at[at] = value;
+    if (HELD != 0u) {
+        [[unroll]] for (uint i = 0u; i < INPUTS; ++i) held[i] = x.at[i * n + sample_];
+    }
+    // That one turn is one the compiler cannot know: what a loop returns is summed up in it. Otherwise a software device moves sums to where
+    // they are stored, away from their products, which then take the way over the stack.
+    uint turns = HELD != 0u ? min(n, 1u) : INPUTS / CHUNK;
+    for (uint tile = slice(); tile < TILES; tile += gl_NumWorkGroups.z) {
+        // The last tile begins where it still is a whole one, and does not store what the tile before it stores.
+        uint first = min(tile * TILE, OUTPUTS - TILE);
+        float sum[TILE];
+        [[unroll]] for (uint t = 0u; t < TILE; ++t) sum[t] = BIAS != 0u ? bias.at[first + t] : 0.0;
+        for (uint turn = 0u; turn < turns; ++turn) add_products(sum, first, turn * CHUNK, CHUNK, sample_);
+        add_products(sum, first, INPUTS / CHUNK * CHUNK, INPUTS % CHUNK, sample_);
+        [[unroll]] for (uint t = 0u; t < TILE; ++t) {
+            if (OUTPUTS % TILE == 0u || first + t >= tile * TILE) {
+                float value = activated(sum[t]);
+                uint at = (first + t) * n + sample_;
+                if (GATED != 0u && !(gate.at[at] > 0.0)) value = 0.0;
+                y.at[at] = value;
+            }
         }
     }
 }

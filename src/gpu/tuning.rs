@@ -3,15 +3,37 @@
 use super::device::Gpu;
 use super::kernel::cache_name;
 use super::recorder::Recorder;
-use crate::{Error, Result};
+use crate::{Error, Result, kernels};
+use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
+use std::hash::{DefaultHasher, Hash, Hasher};
 use std::path::PathBuf;
 use std::sync::Mutex;
 
-/// Answers by question, as names of ways.
+/// What was measured, in a file.
 pub(super) struct Tuning {
-    answers: Mutex<BTreeMap<String, String>>,
+    answers: Mutex<Answers>,
     file: Option<PathBuf>,
+}
+
+/// Answers by question, as names of ways.
+type Answers = BTreeMap<String, String>;
+
+/// The file's contents.
+#[derive(Serialize, Deserialize)]
+struct Kept {
+    /// With which kernels: other ones may have other answers.
+    kernels: String,
+    answers: Answers,
+}
+
+/// A name for the kernels of this program, such as they are.
+fn kernels_at_hand() -> String {
+    let mut hasher = DefaultHasher::new();
+    for module in kernels::ALL {
+        module.spirv.hash(&mut hasher);
+    }
+    format!("{:016x}", hasher.finish())
 }
 
 /// A way takes the place of the first where it needs no more than this share of its time: less of a difference is noise.
@@ -23,20 +45,27 @@ impl Tuning {
         let text = file
             .as_ref()
             .and_then(|file| std::fs::read_to_string(file).ok());
-        let answers = text.and_then(|text| serde_json::from_str(&text).ok());
+        let answers = text
+            .and_then(|text| serde_json::from_str(&text).ok())
+            .filter(|kept: &Kept| kept.kernels == kernels_at_hand())
+            .map(|kept| kept.answers);
         Tuning {
             answers: Mutex::new(answers.unwrap_or_default()),
             file,
         }
     }
 
-    fn save(&self, answers: &BTreeMap<String, String>) -> Result<()> {
+    fn save(&self, answers: &Answers) -> Result<()> {
         let Some(file) = &self.file else {
             return Ok(());
         };
         let failed = |error| Error::io(file, error);
         std::fs::create_dir_all(file.parent().expect("a file in a folder")).map_err(failed)?;
-        let text = serde_json::to_string_pretty(answers).expect("names are text");
+        let kept = Kept {
+            kernels: kernels_at_hand(),
+            answers: answers.clone(),
+        };
+        let text = serde_json::to_string_pretty(&kept).expect("names are text");
         let beside = file.with_extension(format!("{}.part", std::process::id()));
         std::fs::write(&beside, text + "\n").map_err(failed)?;
         std::fs::rename(&beside, file).map_err(failed)

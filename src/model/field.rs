@@ -249,7 +249,8 @@ impl Field {
         };
         let few_cores = gpu.info().few_cores;
         // Always compensated: a gradient by finite differences would not survive float16.
-        let by_matrices = (Forms::of(gpu)?.linear).by_matrices([shape.inputs(), shape.hidden]);
+        let by_matrices =
+            (Forms::of(gpu, shape.hidden)?.linear).by_matrices([shape.inputs(), shape.hidden]);
         let hidden_layer = |backward_inputs| LayerShape {
             inputs: shape.inputs(),
             outputs: shape.hidden,

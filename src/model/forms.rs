@@ -1,6 +1,6 @@
 //! How the products of a layer are computed, and which way of it is fastest on a device.
 
-use super::layer::{Activation, Layer, LayerShape};
+use super::layer::{Activation, Layer, LayerShape, MOST_HELD};
 use super::params::{Group, Params, ParamsPlan};
 use crate::Result;
 use crate::gpu::{Buffer, DeviceKind, Gpu, Kernel, KernelShape, Matrices, Recorder};
@@ -34,9 +34,10 @@ impl Form {
         Form { matrices, ..self }
     }
 
-    /// Channels per invocation where there are so many at all; what cooperative matrices take, [`Kernel::matrix_tile`] says.
+    /// Channels per invocation, so that no tile has more than the form says and all are about equal; what cooperative matrices take,
+    /// [`Kernel::matrix_tile`] says.
     pub fn tile(&self, channels: u32) -> u32 {
-        self.tile.min(channels)
+        channels.div_ceil(channels.div_ceil(self.tile))
     }
 
     /// Whether a product of this size is computed by cooperative matrices.
@@ -68,14 +69,20 @@ impl std::fmt::Display for Form {
 }
 
 impl Forms {
-    const USUAL: Forms = Forms {
-        linear: Form::tiles(16),
-        gradient: Form::tiles(32),
-    };
-
-    /// What the device was opened for; where that is left to it, what it does fastest.
-    pub fn of(gpu: &Gpu) -> Result<Forms> {
-        let usual = Forms::USUAL;
+    /// What the device was opened for; where that is left to it, what it does fastest with a layer about as wide.
+    pub fn of(gpu: &Gpu, width: u32) -> Result<Forms> {
+        // What comes first is the usual.
+        let mut linear = match width <= MOST_HELD {
+            true => [16, 24, 8],
+            false => [24, 16, 8],
+        }
+        .map(Form::tiles)
+        .to_vec();
+        let mut gradient = [32, 16].map(Form::tiles).to_vec();
+        let usual = Forms {
+            linear: linear[0],
+            gradient: gradient[0],
+        };
         let (wanted, info) = (gpu.options().matrices, gpu.info());
         if wanted.is_demanded() {
             return Ok(Forms {
@@ -83,21 +90,31 @@ impl Forms {
                 gradient: usual.gradient.by(wanted),
             });
         }
-        let mut linear = [16, 8, 32].map(Form::tiles).to_vec();
-        let mut gradient = [32, 16].map(Form::tiles).to_vec();
         // Software devices imitate matrices, several times slower than what they do without.
         if wanted == Matrices::Auto && info.matrix.is_some() && info.kind != DeviceKind::Cpu {
             linear.push(usual.linear.by(Matrices::Compensated));
             gradient.push(usual.gradient.by(Matrices::Compensated));
         }
+        // So many samples that a launch itself costs little beside them.
+        let size = match gpu.info().kind {
+            DeviceKind::Cpu if width <= MOST_HELD => (64, 1 << 13),
+            DeviceKind::Cpu => (256, 1 << 11),
+            _ => (256, 1 << 16),
+        };
         let with_linear = |linear| Forms { linear, ..usual };
         let with_gradient = |gradient| Forms { gradient, ..usual };
         Ok(Forms {
-            linear: Trial::fastest(gpu, "forward", &linear, with_linear, |t, layer, rec| {
-                layer.forward(rec, &t.params, t.x.ptr(), t.y.ptr_mut(), t.n)
-            })?,
+            linear: Trial::fastest(
+                gpu,
+                size,
+                "forward",
+                &linear,
+                with_linear,
+                |t, layer, rec| layer.forward(rec, &t.params, t.x.ptr(), t.y.ptr_mut(), t.n),
+            )?,
             gradient: Trial::fastest(
                 gpu,
+                size,
                 "gradient",
                 &gradient,
                 with_gradient,
@@ -142,19 +159,15 @@ impl Trial {
         })
     }
 
-    /// The fastest way to compute a layer as wide as the presets for such devices have it, for so many samples that a launch itself costs
-    /// little beside them.
+    /// The fastest way to compute a layer of that width, with so many samples.
     fn fastest(
         gpu: &Gpu,
+        (width, n): (u32, u32),
         product: &str,
         ways: &[Form],
         forms: impl Fn(Form) -> Forms,
         run: impl Fn(&Trial, &Layer, &mut Recorder),
     ) -> Result<Form> {
-        let (width, n) = match gpu.info().kind {
-            DeviceKind::Cpu => (64, 1 << 13),
-            _ => (256, 1 << 16),
-        };
         let names: Vec<String> = ways.iter().map(Form::to_string).collect();
         let all: Vec<Forms> = ways.iter().map(|&way| forms(way)).collect();
         let fastest = gpu.fastest(

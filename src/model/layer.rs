@@ -22,9 +22,9 @@ pub struct Layer {
     first_row: u32,
     handle: WeightHandle,
     forms: Forms,
-    forward: Kernel<linear::Args>,
+    forward: Product,
     /// Adjoint with respect to the first `backward_inputs` inputs; none where nobody asks for them.
-    backward: Option<(u32, Kernel<linear::Args>)>,
+    backward: Option<Product>,
     gradient: Kernel<weight_gradient::Args>,
 }
 
@@ -40,13 +40,67 @@ pub struct LayerShape {
     pub inputs_are_relu: bool,
 }
 
+/// `linear` for products of one size.
+struct Product {
+    kernel: Kernel<linear::Args>,
+    inputs: u32,
+    outputs: u32,
+    /// Parts into which a launch cuts the outputs.
+    slices: u32,
+}
+
+/// Inputs that an invocation of `linear` holds at most: with more, its code would no longer fit a processor's cache.
+pub(super) const MOST_HELD: u32 = 80;
+
+impl Product {
+    /// `shape.tile` and `shape.held` are chosen here.
+    fn new(gpu: &Gpu, label: &str, shape: linear::Shape, forms: Forms) -> Result<Product> {
+        let (inputs, outputs) = (shape.inputs, shape.outputs);
+        let tile = forms.linear.tile(outputs);
+        // A few cores have work enough in the samples; reading an input anew for each tile costs them as much as its products.
+        let held = gpu.info().few_cores && inputs <= MOST_HELD;
+        let shape = linear::Shape {
+            tile,
+            held: u32::from(held),
+            ..shape
+        };
+        let kernel = forms.linear.kernel(gpu, [inputs, outputs], shape)?;
+        let slices = match kernel.matrix_tile() {
+            Some([rows, _]) => outputs.div_ceil(rows),
+            None if held => 1,
+            None => outputs.div_ceil(tile),
+        };
+        Ok(Product {
+            kernel: kernel.labelled(label),
+            inputs,
+            outputs,
+            slices,
+        })
+    }
+
+    fn run(&self, rec: &mut Recorder, args: linear::Args) {
+        let (work, samples) = match self.kernel.matrix_tile() {
+            Some([_, columns]) => (Work::groups(args.n.div_ceil(columns).into()), columns),
+            None => (Work::items(args.n.into()), 1),
+        };
+        let connections = f64::from(self.inputs) * f64::from(self.outputs);
+        let share = f64::from(samples) / f64::from(self.slices);
+        let work = work
+            .slices(self.slices)
+            .flops(2.0 * connections * share)
+            .bytes(4.0 * f64::from(self.inputs + self.outputs) * share);
+        rec.run(&self.kernel, work, args);
+    }
+}
+
 /// Samples that one workgroup of the weight gradient sums up.
 const GRADIENT_CHUNK: u32 = 1024;
 
 impl Layer {
     /// Builds the layer's kernels, in the forms that suit the device; `label` names their rows in the profile.
     pub fn new(gpu: &Gpu, label: &str, shape: LayerShape, handle: WeightHandle) -> Result<Layer> {
-        Layer::in_forms(gpu, label, shape, handle, Forms::of(gpu)?)
+        let forms = Forms::of(gpu, shape.inputs.max(shape.outputs))?;
+        Layer::in_forms(gpu, label, shape, handle, forms)
     }
 
     pub(super) fn in_forms(
@@ -65,7 +119,8 @@ impl Layer {
             bias,
             activation: shape.activation as u32,
             gated: 0,
-            tile: forms.linear.tile(shape.outputs),
+            tile: 1,
+            held: 0,
         };
         let backward = if shape.backward_inputs > 0 {
             let adjoint = linear::Shape {
@@ -75,13 +130,10 @@ impl Layer {
                 bias: 0,
                 activation: 0,
                 gated: u32::from(shape.inputs_are_relu),
-                tile: forms.linear.tile(shape.backward_inputs),
                 ..base
             };
-            let size = [adjoint.inputs, adjoint.outputs];
-            let kernel = forms.linear.kernel(gpu, size, adjoint)?;
             let row = format!("{label} backward");
-            Some((shape.backward_inputs, kernel.labelled(&row)))
+            Some(Product::new(gpu, &row, adjoint, forms)?)
         } else {
             None
         };
@@ -98,7 +150,7 @@ impl Layer {
             first_row: shape.first_row,
             handle,
             forms,
-            forward: (forms.linear.kernel(gpu, size, base)?).labelled(&format!("{label} forward")),
+            forward: Product::new(gpu, &format!("{label} forward"), base, forms)?,
             backward,
             gradient: forms.gradient.kernel(gpu, size, gradient)?.labelled(label),
         })
@@ -111,25 +163,6 @@ impl Layer {
 
     fn weight_offset(&self) -> u64 {
         u64::from(self.first_row) * u64::from(self.inputs)
-    }
-
-    /// Work of `linear` for so many samples and output channels.
-    fn work(&self, kernel: &Kernel<linear::Args>, n: u32, outputs: u32) -> Work {
-        let (work, samples, slices) = match kernel.matrix_tile() {
-            Some([rows, columns]) => {
-                let groups = n.div_ceil(columns);
-                (Work::groups(groups.into()), columns, outputs.div_ceil(rows))
-            }
-            None => {
-                let tile = self.forms.linear.tile(outputs);
-                (Work::items(n.into()), 1, outputs.div_ceil(tile))
-            }
-        };
-        let connections = f64::from(self.inputs) * f64::from(self.outputs);
-        let share = f64::from(samples) / f64::from(slices);
-        work.slices(slices)
-            .flops(2.0 * connections * share)
-            .bytes(4.0 * f64::from(self.inputs + self.outputs) * share)
     }
 
     /// `y [outputs, n]` from `x [inputs, n]`.
@@ -149,11 +182,7 @@ impl Layer {
             y,
             n,
         };
-        rec.run(
-            &self.forward,
-            self.work(&self.forward, n, self.outputs),
-            args,
-        );
+        self.forward.run(rec, args);
     }
 
     /// `d_x [backward_inputs, n]` from the gradient `d_y [outputs, n]` before the activation; `x` gates it where the inputs are ReLU's.
@@ -166,7 +195,7 @@ impl Layer {
         d_x: PtrMut<f32>,
         n: u32,
     ) {
-        let (outputs, kernel) = self
+        let product = self
             .backward
             .as_ref()
             .expect("a layer built without input gradients was asked for them");
@@ -178,7 +207,7 @@ impl Layer {
             y: d_x,
             n,
         };
-        rec.run(kernel, self.work(kernel, n, *outputs), args);
+        product.run(rec, args);
     }
 
     /// Adds the gradients of weights and bias, from `x` (channels `stride_x` apart) and `d_y [outputs, n]`.
