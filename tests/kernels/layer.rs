@@ -109,6 +109,10 @@ impl Case {
             layer.gradient(rec, &params, x.ptr(), n, d_y.ptr(), n);
             Ok(())
         })?;
+        // While the buffers live: their guard words go with them.
+        gpu.finish()?;
+        let overruns = gpu.check_guards()?;
+        assert!(overruns.is_empty(), "written past an end: {overruns:?}");
         let wide = |values: Vec<f32>| values.into_iter().map(f64::from).collect();
         let grads = |first, len| gpu.download(params.grads(), first, len).map(wide);
         Ok([
@@ -141,9 +145,6 @@ fn check(matrices: Matrices, portable: bool, most: f64) -> Result<()> {
             assert!(distance <= most, "{size:?} {product}: {distance:e}");
         }
     }
-    gpu.finish()?;
-    let overruns = gpu.check_guards()?;
-    assert!(overruns.is_empty(), "written past an end: {overruns:?}");
     let messages = gpu.validation_messages();
     assert!(messages.is_empty(), "{}", messages.join("\n"));
     Ok(())
