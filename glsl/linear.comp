@@ -1,7 +1,6 @@
 #version 460
 // One layer of a network on planar activations: Y = σ(WX + b), or with TRANSPOSED its adjoint d_X = Wᵀd_Y, gated by the derivative
-// of the ReLU that made X. One sample and TILE output channels per invocation, the slice picks the channels; or all tiles of a sample,
-// one after the other, in a launch of one slice.
+// of the ReLU that made X. One sample and TILE output channels per invocation, the slice picks the channels; with HELD all tiles of a sample.
 #include "lib/prelude.glsl"
 
 layout(constant_id = 0) const uint INPUTS = 64;
@@ -46,7 +45,8 @@ void main() {
     // That one turn is one the compiler cannot know: what a loop returns is summed up in it. Otherwise a software device moves sums to where
     // they are stored, away from their products, which then take the way over the stack.
     uint turns = HELD != 0u ? min(n, 1u) : INPUTS / CHUNK;
-    for (uint tile = slice(); tile < TILES; tile += gl_NumWorkGroups.z) {
+    uint end = HELD != 0u ? TILES : slice() + 1u;
+    for (uint tile = slice(); tile < end; ++tile) {
         // The last tile begins where it still is a whole one, and does not store what the tile before it stores.
         uint first = min(tile * TILE, OUTPUTS - TILE);
         float sum[TILE];

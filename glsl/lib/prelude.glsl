@@ -62,12 +62,12 @@ vec2 pair_at(F32s p, uint i) { return uintBitsToFloat(unpackUint2x32(U64s(uvec2(
 void set_pair(F32sMut p, uint i, vec2 v) { U64sMut(uvec2(p)).at[i >> 1u] = packUint2x32(floatBitsToUint(v)); }
 #endif
 
-// Index of this invocation among the launch's items, in rows of 256 workgroups: one dimension of a grid ends at 65535 workgroups.
-// The last row is ragged, so a kernel leaves its body where item() >= n.
-uint item() { return (gl_WorkGroupID.y * 256u + gl_WorkGroupID.x) * gl_WorkGroupSize.x + gl_LocalInvocationID.x; }
+// Index of this invocation's workgroup among the launch's, which stand in rows: one dimension of a grid ends at 65535 workgroups. For
+// kernels that give a workgroup (or a subgroup) one piece of work.
+uint group() { return gl_WorkGroupID.y * gl_NumWorkGroups.x + gl_WorkGroupID.x; }
 
-// Index of this invocation's workgroup among them; for kernels that give a workgroup (or a subgroup) one piece of work.
-uint group() { return gl_WorkGroupID.y * 256u + gl_WorkGroupID.x; }
+// Index of this invocation among the launch's items. There may be more invocations, so a kernel leaves its body where item() >= n.
+uint item() { return group() * gl_WorkGroupSize.x + gl_LocalInvocationID.x; }
 
 // The launch's second dimension (Work::slices): level, layer, axis.
 uint slice() { return gl_WorkGroupID.z; }

@@ -1,8 +1,8 @@
 //! Recording: launches, copies and fills, in the order in which they take effect.
 //!
-//! The caller says how many items; grid, limits, barriers and the cut into submissions are made here. A grid has rows of 256 workgroups,
-//! (min(groups, 256), ⌈groups / 256⌉, slices), since one dimension ends at 65535. Submissions are cut by estimated time, because a
-//! watchdog ends what runs for seconds; one large launch is itself cut along its rows.
+//! The caller says how many items; grid, limits, barriers and the cut into submissions are made here. A grid has rows of at most 256
+//! workgroups, equally long, since one dimension ends at 65535. Submissions are cut by estimated time, because a watchdog ends what runs for
+//! seconds; one large launch is itself cut along its rows.
 
 use super::buffer::Buffer;
 use super::device::{Gpu, vulkan};
@@ -19,7 +19,7 @@ use std::sync::Arc;
 
 /// Seconds of estimated work after which a submission is cut.
 const SUBMISSION_SECONDS: f64 = 0.2;
-/// Workgroups in one row of a grid; lib/prelude.glsl's item() says the same.
+/// Workgroups in one row of a grid, at most. All rows of a launch are equally long: a short last one would leave processors idle.
 const ROW: u64 = 256;
 /// What one dimension of a grid has everywhere.
 const MAX_GROUPS: u64 = 65535;
@@ -174,7 +174,8 @@ impl<'a> Recorder<'a> {
         if groups == 0 || work.slices == 0 || self.error.is_some() {
             return;
         }
-        let (width, rows) = (groups.min(ROW), groups.div_ceil(ROW));
+        let rows = groups.div_ceil(ROW);
+        let width = groups.div_ceil(rows);
         let limit = u64::from(u32::MAX) / (ROW * local);
         assert!(
             rows <= MAX_GROUPS.min(limit) && work.slices as u64 <= MAX_GROUPS,
