@@ -10,8 +10,7 @@
 // 1: the first n_hidden points have further heads; 0: none at hand has. (lavapipe asks every lane at every access whether it has: a launch
 // for those that have and one for the others is faster.)
 layout(constant_id = 7) const uint HEADS = 1;
-layout(constant_id = 8) const uint BLOCK = 64;  // hidden neurons that are written out one after the other; divides HIDDEN
-layout(constant_id = 9) const uint PART = 0;    // 0 everything, 1 the encoding of one level per slice, 2 the network
+layout(constant_id = 8) const uint PART = 0;  // 0 everything, 1 the encoding of one level per slice, 2 the network
 
 layout(push_constant, scalar) uniform Args {
     Levels levels;
@@ -63,20 +62,17 @@ void main() {
     [[unroll]] for (uint i = 0u; i < INPUTS; ++i) z[i] = inputs.at[i * n + point];
 
     float sum = BIAS != 0u ? head_bias.at[0] : 0.0;
-    for (uint block = 0u; block < HIDDEN; block += BLOCK) {
-        F32s weight = from(hidden_weight, block * INPUTS);
-        [[unroll]] for (uint tile = 0u; tile < BLOCK; tile += TILE) {
-            uint first_neuron = block + tile;
-            float u[TILE];
-            [[unroll]] for (uint t = 0u; t < TILE; ++t) u[t] = BIAS != 0u ? hidden_bias.at[first_neuron + t] : 0.0;
-            [[unroll]] for (uint i = 0u; i < INPUTS; ++i) {
-                [[unroll]] for (uint t = 0u; t < TILE; ++t) u[t] = fma(weight.at[(tile + t) * INPUTS + i], z[i], u[t]);
-            }
-            [[unroll]] for (uint t = 0u; t < TILE; ++t) {
-                float h = activation(u[t]);
-                sum = fma(head_weight.at[first_neuron + t], h, sum);
-                if (HEADS != 0u && point < n_hidden) hidden.at[(first_neuron + t) * n_hidden + point] = h;
-            }
+    for (uint first_neuron = 0u; first_neuron < HIDDEN; first_neuron += TILE) {
+        F32s weight = from(hidden_weight, first_neuron * INPUTS);
+        float u[TILE];
+        [[unroll]] for (uint t = 0u; t < TILE; ++t) u[t] = BIAS != 0u ? hidden_bias.at[first_neuron + t] : 0.0;
+        [[unroll]] for (uint i = 0u; i < INPUTS; ++i) {
+            [[unroll]] for (uint t = 0u; t < TILE; ++t) u[t] = fma(weight.at[t * INPUTS + i], z[i], u[t]);
+        }
+        [[unroll]] for (uint t = 0u; t < TILE; ++t) {
+            float h = activation(u[t]);
+            sum = fma(head_weight.at[first_neuron + t], h, sum);
+            if (HEADS != 0u && point < n_hidden) hidden.at[(first_neuron + t) * n_hidden + point] = h;
         }
     }
     first.at[point] = sum;

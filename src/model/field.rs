@@ -12,9 +12,6 @@ use crate::kernels::{
 };
 use std::ops::Range;
 
-/// Weights up to which a network's forward pass is straight-line code: beyond, drivers take long over it and make it slower.
-const MOST_WRITTEN_OUT: u32 = 64 * 64;
-
 /// Points that go back through a field at once: the memory that this takes is theirs alone.
 const AT_ONCE: u32 = 1 << 16;
 
@@ -230,10 +227,6 @@ impl Field {
             bias,
             tile,
             heads: 1,
-            block: match shape.hidden * shape.inputs() > MOST_WRITTEN_OUT {
-                true => tile,
-                false => shape.hidden,
-            },
             part: 0,
         };
         let backward = field_backward::Shape {
