@@ -16,9 +16,11 @@ use crate::train::run_directory::scene_options;
 use crate::{Error, Result};
 use clap::Args;
 use serde_json::{Value, json};
+use std::cell::{Cell, RefCell};
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
+use std::time::Instant;
 
 /// Measure the device, every kernel, and steps by the size of the dictionary
 #[derive(Args)]
@@ -61,6 +63,14 @@ pub(super) struct BenchArgs {
     pub between: Option<Vec<PathBuf>>,
 }
 
+impl BenchArgs {
+    /// Sizes of dictionaries that are measured, as powers of two.
+    fn dictionaries(&self) -> Vec<u32> {
+        let sizes = self.sizes.iter().copied();
+        sizes.filter(|&size| size > 0).collect()
+    }
+}
+
 pub(super) fn run(args: &BenchArgs, context: &Context) -> anyhow::Result<()> {
     if let Some(files) = &args.between {
         let (result, text) = between::compare(&files[0], &files[1])?;
@@ -92,13 +102,7 @@ pub(super) fn run(args: &BenchArgs, context: &Context) -> anyhow::Result<()> {
     for name in &args.presets {
         presets.extend(bench.preset(name, rays, &roofs)?);
     }
-    let sizes: Vec<u32> = args
-        .sizes
-        .iter()
-        .copied()
-        .filter(|&size| size > 0)
-        .collect();
-    let dictionary = bench.dictionary(&sizes, rays, &roofs)?;
+    let dictionary = bench.dictionary(&args.dictionaries(), rays, &roofs)?;
     let result = json!({
         "version": super::VERSION.as_str(),
         "device": gpu.info().name,
@@ -134,6 +138,9 @@ struct Bench<'c> {
     folder: PathBuf,
     interrupted: std::sync::Arc<AtomicBool>,
     seconds: f64,
+    /// In seconds of steps.
+    progress: RefCell<Progress>,
+    measured: Cell<f64>,
 }
 
 impl Drop for Bench<'_> {
@@ -149,11 +156,16 @@ const WARMUP: u64 = 3;
 impl<'c> Bench<'c> {
     fn new(args: &BenchArgs, context: &'c Context) -> anyhow::Result<Bench<'c>> {
         let folder = std::env::temp_dir().join(format!("neurodin-bench-{}", std::process::id()));
+        // Both stages of each preset, and a dictionary's first.
+        let measurements = 2 * args.presets.len() + args.dictionaries().len();
+        let total = (args.seconds * measurements as f64).ceil() as u64;
         let bench = Bench {
             context,
             interrupted: interrupt::flag("stopping")?,
             seconds: args.seconds,
             folder,
+            progress: RefCell::new(Progress::new(context, "bench", total)),
+            measured: Cell::new(0.0),
         };
         let pictures = SyntheticOptions {
             train_views: 12,
@@ -251,17 +263,20 @@ impl<'c> Bench<'c> {
         let scene = Scene::open(&self.folder, &scene_options(config))?;
         let region = Region::estimate(&scene, &region_wanted(&Default::default(), config))?;
         let mut trainer = Trainer::new(&gpu, &scene, &region, config)?;
-        let mut progress = Progress::new(self.context, "bench", config.total_steps());
+        let start = Instant::now();
         let timed = time(
             &gpu,
             &mut trainer,
             WARMUP,
             Until::Seconds(self.seconds),
-            &mut |step| {
-                progress.at(step, what);
+            &mut |_| {
+                let seconds = start.elapsed().as_secs_f64().min(self.seconds);
+                let done = self.measured.get() + seconds;
+                self.progress.borrow_mut().at(done as u64, what);
                 stop_if(&self.interrupted)
             },
         )?;
+        self.measured.set(self.measured.get() + self.seconds);
         Ok((timed, gpu.memory_plan().total))
     }
 }
