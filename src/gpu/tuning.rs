@@ -32,6 +32,8 @@ fn kernels_at_hand() -> String {
     let mut hasher = DefaultHasher::new();
     for module in kernels::ALL {
         module.spirv.hash(&mut hasher);
+        let by_matrices = module.cooperative.map(|module| module.spirv);
+        by_matrices.hash(&mut hasher);
     }
     format!("{:016x}", hasher.finish())
 }
