@@ -11,6 +11,8 @@
 
 layout(constant_id = 7) const uint HEADS = 1;  // as in field_forward
 layout(constant_id = 8) const uint SECOND_ORDER = 0;
+layout(constant_id = 9) const uint STRAIGHT = 0;
+#include "lib/straight.glsl"
 
 layout(push_constant, scalar) uniform Args {
     F32s hidden_weight;      // [HIDDEN, INPUTS]
@@ -62,7 +64,9 @@ void main() {
     float d_z[OUT_INPUTS];
     [[unroll]] for (uint i = 0u; i < OUT_INPUTS; ++i) d_z[i] = 0.0;
 
-    for (uint first_neuron = 0u; first_neuron < HIDDEN; first_neuron += TILE) {
+    uint neurons = turns(HIDDEN, n);
+    uint first_neuron = 0u;
+    [[unroll]] do {
         F32s weight = from(hidden_weight, first_neuron * INPUTS);
         float u[TILE];
         [[unroll]] for (uint t = 0u; t < TILE; ++t) u[t] = BIAS != 0u ? hidden_bias.at[first_neuron + t] : 0.0;
@@ -105,7 +109,8 @@ void main() {
             [[unroll]] for (uint t = 0u; t < TILE; ++t)
                 d_z[i] = fma(weight.at[t * INPUTS + FIRST_INPUT + i], u[t], d_z[i]);
         }
-    }
+        first_neuron += TILE;
+    } while (first_neuron < neurons);
     [[unroll]] for (uint i = 0u; i < OUT_INPUTS; ++i) d_inputs.at[i * m + q] = d_z[i];
     if (BIAS != 0u) {
         float d_b2 = subgroupAdd(inside ? d_out : 0.0);

@@ -10,7 +10,9 @@
 // 1: the first n_hidden points have further heads; 0: none at hand has. (lavapipe asks every lane at every access whether it has: a launch
 // for those that have and one for the others is faster.)
 layout(constant_id = 7) const uint HEADS = 1;
-layout(constant_id = 8) const uint PART = 0;  // 0 everything, 1 the encoding of one level per slice, 2 the network
+layout(constant_id = 8) const uint PART = 0;      // 0 everything, 1 the encoding of one level per slice, 2 the network
+layout(constant_id = 9) const uint STRAIGHT = 0;
+#include "lib/straight.glsl"
 
 layout(push_constant, scalar) uniform Args {
     Levels levels;
@@ -30,8 +32,10 @@ layout(push_constant, scalar) uniform Args {
 };
 
 void main() {
+    // In straight-line code, invocations past the end do the last point once more, and write what its own invocation writes.
     uint point = begin + item();
-    if (point >= end) return;
+    if (STRAIGHT != 0u) point = min(point, end - 1u);
+    else if (point >= end) return;
     vec3 x = vec3(points.at[point], points.at[n + point], points.at[2u * n + point]);
     if (PART != 2u) {
         uint first_level = PART == 1u ? level_of_slice(LEVELS) : 0u;
@@ -62,7 +66,9 @@ void main() {
     [[unroll]] for (uint i = 0u; i < INPUTS; ++i) z[i] = inputs.at[i * n + point];
 
     float sum = BIAS != 0u ? head_bias.at[0] : 0.0;
-    for (uint first_neuron = 0u; first_neuron < HIDDEN; first_neuron += TILE) {
+    uint neurons = turns(HIDDEN, n);
+    uint first_neuron = 0u;
+    [[unroll]] do {
         F32s weight = from(hidden_weight, first_neuron * INPUTS);
         float u[TILE];
         [[unroll]] for (uint t = 0u; t < TILE; ++t) u[t] = BIAS != 0u ? hidden_bias.at[first_neuron + t] : 0.0;
@@ -74,6 +80,7 @@ void main() {
             sum = fma(head_weight.at[first_neuron + t], h, sum);
             if (HEADS != 0u && point < n_hidden) hidden.at[(first_neuron + t) * n_hidden + point] = h;
         }
-    }
+        first_neuron += TILE;
+    } while (first_neuron < neurons);
     first.at[point] = sum;
 }

@@ -6,6 +6,9 @@
 #include "lib/hash_grid.glsl"
 #include "lib/field.glsl"
 
+layout(constant_id = 7) const uint STRAIGHT = 0;
+#include "lib/straight.glsl"
+
 layout(push_constant, scalar) uniform Args {
     Levels levels;
     F32s table;          // [entries, FEATURES]
@@ -20,13 +23,17 @@ layout(push_constant, scalar) uniform Args {
 };
 
 void main() {
+    // In straight-line code, invocations past the end do the last point once more, and write what its own invocation writes.
     uint point = item();
-    if (point >= n) return;
+    if (STRAIGHT != 0u) point = min(point, n - 1u);
+    else if (point >= n) return;
     float z[INPUTS];
     [[unroll]] for (uint i = 0u; i < INPUTS; ++i) z[i] = inputs.at[i * n + point];
     float a[INPUTS];
     [[unroll]] for (uint i = 0u; i < INPUTS; ++i) a[i] = 0.0;
-    for (uint first_neuron = 0u; first_neuron < HIDDEN; first_neuron += TILE) {
+    uint neurons = turns(HIDDEN, n);
+    uint first_neuron = 0u;
+    [[unroll]] do {
         F32s weight = from(hidden_weight, first_neuron * INPUTS);
         float u[TILE];
         [[unroll]] for (uint t = 0u; t < TILE; ++t) u[t] = BIAS != 0u ? hidden_bias.at[first_neuron + t] : 0.0;
@@ -37,7 +44,8 @@ void main() {
         [[unroll]] for (uint i = 0u; i < INPUTS; ++i) {
             [[unroll]] for (uint t = 0u; t < TILE; ++t) a[i] = fma(weight.at[t * INPUTS + i], u[t], a[i]);
         }
-    }
+        first_neuron += TILE;
+    } while (first_neuron < neurons);
     [[unroll]] for (uint i = 0u; i < INPUTS; ++i) slopes.at[i * n + point] = a[i];
 
     vec3 g = vec3(0.0);

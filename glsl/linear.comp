@@ -12,9 +12,11 @@ layout(constant_id = 5) const uint ACTIVATION = 0;       // 0 none, 1 ReLU, 2 si
 layout(constant_id = 6) const uint GATED = 0;            // multiply by 1[gate > 0]
 layout(constant_id = 7) const uint TILE = 16;            // at most OUTPUTS
 layout(constant_id = 8) const uint HELD = 0;             // an invocation holds its inputs, for all of its tiles
+layout(constant_id = 9) const uint STRAIGHT = 0;         // with HELD: no loops
 const uint TILES = (OUTPUTS + TILE - 1u) / TILE;
 const uint CHUNK = HELD != 0u ? INPUTS : 8u;             // inputs that are written out one after the other
 #include "lib/linear.glsl"
+#include "lib/straight.glsl"
 
 layout(push_constant, scalar) uniform Args {
     F32s x;         // [INPUTS, n]
@@ -37,21 +39,22 @@ void add_products(inout float sum[TILE], uint first, uint i0, const uint count, 
 }
 
 void main() {
-    uint sample_ = item();
-    if (sample_ >= n) return;
+    // Invocations past the end do the last sample once more, and write what its own invocation writes.
+    uint sample_ = min(item(), n - 1u);
     if (HELD != 0u) {
         [[unroll]] for (uint i = 0u; i < INPUTS; ++i) held[i] = x.at[i * n + sample_];
     }
-    // That one turn is one the compiler cannot know: what a loop returns is summed up in it. Otherwise a software device moves sums to where
-    // they are stored, away from their products, which then take the way over the stack.
-    uint turns = HELD != 0u ? min(n, 1u) : INPUTS / CHUNK;
-    uint end = HELD != 0u ? TILES : slice() + 1u;
-    for (uint tile = slice(); tile < end; ++tile) {
+    // Of what is held there is one chunk, but the compiler cannot know it: what a loop returns is summed up in it. Otherwise a software
+    // device moves sums to where they are stored, away from their products, which then take the way over the stack.
+    uint chunks = turns(INPUTS / CHUNK, n);
+    uint begin = HELD != 0u ? 0u : slice();
+    uint end = HELD != 0u ? turns(TILES, n) : begin + 1u;
+    [[unroll]] for (uint tile = begin; tile < end; ++tile) {
         // The last tile begins where it still is a whole one, and does not store what the tile before it stores.
         uint first = min(tile * TILE, OUTPUTS - TILE);
         float sum[TILE];
         [[unroll]] for (uint t = 0u; t < TILE; ++t) sum[t] = BIAS != 0u ? bias.at[first + t] : 0.0;
-        for (uint turn = 0u; turn < turns; ++turn) add_products(sum, first, turn * CHUNK, CHUNK, sample_);
+        [[unroll]] for (uint c = 0u; c < chunks; ++c) add_products(sum, first, c * CHUNK, CHUNK, sample_);
         add_products(sum, first, INPUTS / CHUNK * CHUNK, INPUTS % CHUNK, sample_);
         [[unroll]] for (uint t = 0u; t < TILE; ++t) {
             if (OUTPUTS % TILE == 0u || first + t >= tile * TILE) {

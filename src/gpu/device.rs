@@ -37,6 +37,8 @@ pub struct GpuOptions {
     /// Measures which shapes of kernels are fastest here, at the first start, and remembers it in the cache folder. Without it, and with
     /// `deterministic`, everything has its usual shape.
     pub autotune: bool,
+    /// Ways that are taken unmeasured wherever they are among those to choose from ([`Gpu::fastest`]).
+    pub ways: Vec<String>,
     /// Bytes of device memory that buffers may take; `None`: what the device has.
     pub memory_limit: Option<u64>,
     /// Folder that keeps compiled pipelines from one run to the next; `None` keeps none. (Software drivers have their own cache and

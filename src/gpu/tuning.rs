@@ -83,8 +83,8 @@ pub(super) fn file_name(info: &super::DeviceInfo) -> String {
 
 impl Gpu {
     /// The fastest of some `ways` of doing the same, each under a name: an index. `question` names what is done; `prepare` makes what
-    /// `run` records it with, where it is not known yet. Where the device was opened without [`super::GpuOptions::autotune`], it is the
-    /// first.
+    /// `run` records it with, where it is not known yet. A way that the device was opened for ([`super::GpuOptions::ways`]) is the fastest
+    /// unmeasured; where it was opened without [`super::GpuOptions::autotune`], the first is.
     ///
     /// # Errors
     /// What `prepare`, `run` or the device fails with.
@@ -95,7 +95,12 @@ impl Gpu {
         prepare: impl FnOnce() -> Result<T>,
         mut run: impl FnMut(&T, usize, &mut Recorder),
     ) -> Result<usize> {
-        if !self.options().autotune || ways.len() < 2 {
+        let options = self.options();
+        let wanted = |way: &String| options.ways.contains(way);
+        if let Some(way) = ways.iter().position(wanted) {
+            return Ok(way);
+        }
+        if !options.autotune || ways.len() < 2 {
             return Ok(0);
         }
         let tuning = &self.inner.tuning;

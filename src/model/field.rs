@@ -218,6 +218,12 @@ impl Field {
         let softplus = u32::from(shape.softplus);
         let bias = u32::from(hidden.bias.is_some());
         let tile = shape.hidden.min(8);
+        let few_cores = gpu.info().few_cores;
+        let form = Forms::of(gpu, shape.hidden)?.linear;
+        let size = [shape.inputs(), shape.hidden];
+        // Always compensated: a gradient by finite differences would not survive float16.
+        let by_matrices = form.by_matrices(size);
+        let straight = u32::from(form.is_straight(size));
         let forward = field_forward::Shape {
             levels: grid_levels,
             features,
@@ -228,6 +234,7 @@ impl Field {
             tile,
             heads: 1,
             part: 0,
+            straight,
         };
         let backward = field_backward::Shape {
             levels: grid_levels,
@@ -239,11 +246,8 @@ impl Field {
             tile,
             heads: 1,
             second_order,
+            straight,
         };
-        let few_cores = gpu.info().few_cores;
-        // Always compensated: a gradient by finite differences would not survive float16.
-        let by_matrices =
-            (Forms::of(gpu, shape.hidden)?.linear).by_matrices([shape.inputs(), shape.hidden]);
         let hidden_layer = |backward_inputs| LayerShape {
             inputs: shape.inputs(),
             outputs: shape.hidden,
@@ -284,6 +288,7 @@ impl Field {
                         softplus,
                         bias,
                         tile,
+                        straight,
                     })?
                     .labelled(label),
                 tangent: gpu

@@ -1,6 +1,6 @@
 //! One fully connected layer on planar activations `[channel, n]`: forward, gradient of the inputs, gradient of the weights.
 
-use super::forms::Forms;
+use super::forms::{Form, Forms};
 use super::params::{Params, WeightHandle};
 use crate::Result;
 use crate::gpu::{Gpu, Kernel, Ptr, PtrMut, Recorder, Work};
@@ -21,11 +21,20 @@ pub struct Layer {
     /// Rows of the matrix that come before this layer's own (heads share one matrix).
     first_row: u32,
     handle: WeightHandle,
-    forms: Forms,
     forward: Product,
     /// Adjoint with respect to the first `backward_inputs` inputs; none where nobody asks for them.
     backward: Option<Product>,
-    gradient: Kernel<weight_gradient::Args>,
+    gradient: WeightGradient,
+    /// What reads samples in pairs, of which there must be an even number.
+    paired_gradient: Option<WeightGradient>,
+}
+
+/// `weight_gradient` in one form: what of d_W and of the samples a workgroup sums up.
+struct WeightGradient {
+    kernel: Kernel<weight_gradient::Args>,
+    outputs: u32,
+    inputs: u32,
+    chunk: u32,
 }
 
 /// Shape of a [`Layer`].
@@ -62,6 +71,7 @@ impl Product {
         let shape = linear::Shape {
             tile,
             held: u32::from(held),
+            straight: u32::from(held && forms.linear.is_straight([inputs, outputs])),
             ..shape
         };
         let kernel = forms.linear.kernel(gpu, [inputs, outputs], shape)?;
@@ -93,8 +103,26 @@ impl Product {
     }
 }
 
-/// Samples that one workgroup of the weight gradient sums up.
-const GRADIENT_CHUNK: u32 = 1024;
+impl WeightGradient {
+    /// `shape.tile` is chosen here.
+    fn new(gpu: &Gpu, label: &str, shape: weight_gradient::Shape, form: Form) -> Result<Self> {
+        let tile = form.tile(shape.inputs);
+        let shape = weight_gradient::Shape { tile, ..shape };
+        let kernel = form.kernel(gpu, [shape.inputs, shape.outputs], shape)?;
+        let [outputs, inputs] = match kernel.matrix_tile() {
+            Some(tile) => tile,
+            None if shape.rows > 0 => [shape.rows, tile],
+            None => [kernel.local_size(), tile],
+        };
+        Ok(WeightGradient {
+            kernel: kernel.labelled(label),
+            outputs,
+            inputs,
+            // Each subgroup adds up what it has of samples, which takes as long as some hundred of them.
+            chunk: if shape.rows > 0 { 4096 } else { 1024 },
+        })
+    }
+}
 
 impl Layer {
     /// Builds the layer's kernels, in the forms that suit the device; `label` names their rows in the profile.
@@ -121,6 +149,7 @@ impl Layer {
             gated: 0,
             tile: 1,
             held: 0,
+            straight: 0,
         };
         let backward = if shape.backward_inputs > 0 {
             let adjoint = linear::Shape {
@@ -141,18 +170,25 @@ impl Layer {
             inputs: shape.inputs,
             outputs: shape.outputs,
             bias,
-            tile: forms.gradient.tile(shape.inputs),
+            tile: 1,
+            rows: 0,
         };
-        let size = [shape.inputs, shape.outputs];
+        let paired_gradient = match forms.gradient.rows(shape.outputs) {
+            Some(rows) => {
+                let shape = weight_gradient::Shape { rows, ..gradient };
+                Some(WeightGradient::new(gpu, label, shape, forms.gradient)?)
+            }
+            None => None,
+        };
         Ok(Layer {
             inputs: shape.inputs,
             outputs: shape.outputs,
             first_row: shape.first_row,
             handle,
-            forms,
             forward: Product::new(gpu, &format!("{label} forward"), base, forms)?,
             backward,
-            gradient: forms.gradient.kernel(gpu, size, gradient)?.labelled(label),
+            gradient: WeightGradient::new(gpu, label, gradient, forms.gradient)?,
+            paired_gradient,
         })
     }
 
@@ -220,6 +256,10 @@ impl Layer {
         d_y: Ptr<f32>,
         n: u32,
     ) {
+        let gradient = match &self.paired_gradient {
+            Some(paired) if n.is_multiple_of(2) && stride_x.is_multiple_of(2) => paired,
+            _ => &self.gradient,
+        };
         let args = weight_gradient::Args {
             x,
             d_y,
@@ -227,24 +267,17 @@ impl Layer {
             d_bias: params.d_bias(self.handle, u64::from(self.first_row)),
             n,
             stride_x,
-            chunk: GRADIENT_CHUNK,
+            chunk: gradient.chunk,
         };
-        // Outputs and inputs of a workgroup.
-        let [rows, columns] = match self.gradient.matrix_tile() {
-            Some(tile) => tile,
-            None => [
-                self.gradient.local_size(),
-                self.forms.gradient.tile(self.inputs),
-            ],
-        };
-        let chunks = n.div_ceil(GRADIENT_CHUNK);
-        let slices = self.outputs.div_ceil(rows) * self.inputs.div_ceil(columns);
-        let (rows, columns) = (rows.min(self.outputs), columns.min(self.inputs));
-        let samples = f64::from(n.min(GRADIENT_CHUNK));
-        let work = Work::groups(chunks.into())
+        let slices =
+            self.outputs.div_ceil(gradient.outputs) * self.inputs.div_ceil(gradient.inputs);
+        let outputs = f64::from(gradient.outputs.min(self.outputs));
+        let inputs = f64::from(gradient.inputs.min(self.inputs));
+        let samples = f64::from(n.min(gradient.chunk));
+        let work = Work::groups(n.div_ceil(gradient.chunk).into())
             .slices(slices)
-            .flops(2.0 * f64::from(rows) * f64::from(columns) * samples)
-            .bytes(4.0 * f64::from(rows + columns) * samples);
-        rec.run(&self.gradient, work, args);
+            .flops(2.0 * outputs * inputs * samples)
+            .bytes(4.0 * (outputs + inputs) * samples);
+        rec.run(&gradient.kernel, work, args);
     }
 }

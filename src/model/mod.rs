@@ -13,6 +13,7 @@ mod surface;
 
 pub use background::{Background, BackgroundBuffers, BackgroundRays};
 pub use field::{Field, FieldBuffers, FieldShape, Scratch};
+pub use forms::layer_ways;
 pub use hash_grid::HashGrid;
 pub use layer::{Activation, Layer, LayerShape};
 pub use lazy_table::{LazyTable, Rates};

@@ -87,3 +87,17 @@ fn without_tuning_it_is_the_first() -> Result<()> {
     }
     Ok(())
 }
+
+#[test]
+fn a_wanted_way_is_taken_unmeasured() -> Result<()> {
+    let wants = |way: &str| {
+        Gpu::new(&GpuOptions {
+            autotune: true,
+            ways: vec![way.into()],
+            ..GpuOptions::default()
+        })
+    };
+    assert_eq!(ask(&wants("long")?, ["short", "long"])?, (1, false));
+    assert_eq!(ask(&wants("another")?, ["long", "short"])?, (1, true));
+    Ok(())
+}

@@ -2,8 +2,12 @@
 
 use crate::harness::Random;
 use neurodin::gpu::{Buffer, Gpu, GpuOptions, Matrices};
-use neurodin::model::{Activation, Group, Init, Layer, LayerShape, ParamsPlan, WeightHandle};
+use neurodin::model::{
+    Activation, Group, Init, Layer, LayerShape, ParamsPlan, WeightHandle, layer_ways,
+};
 use neurodin::{Error, Result};
+use std::collections::BTreeSet;
+use std::sync::OnceLock;
 
 /// (inputs, outputs, samples): narrow, odd in every direction, and several tiles of everything.
 const SIZES: [(usize, usize, usize); 4] =
@@ -124,25 +128,40 @@ impl Case {
     }
 }
 
+/// What is asked of every way, and the answers.
+fn cases() -> &'static [(Case, [Vec<f64>; 4])] {
+    static CASES: OnceLock<Vec<(Case, [Vec<f64>; 4])>> = OnceLock::new();
+    CASES.get_or_init(|| {
+        let mut random = Random(11);
+        let cases = SIZES.map(|size| Case::new(size, &mut random));
+        let with_twin = |case: Case| {
+            let twin = case.twin();
+            (case, twin)
+        };
+        cases.into_iter().map(with_twin).collect()
+    })
+}
+
 /// Every product within a relative L2 distance, guard words whole, nothing to say for the validation layer.
-fn check(matrices: Matrices, portable: bool, most: f64) -> Result<()> {
+fn check(options: GpuOptions, most: f64) -> Result<()> {
     let gpu = Gpu::new(&GpuOptions {
         validation: true,
         guard: true,
-        portable,
-        matrices,
-        ..GpuOptions::default()
+        ..options.clone()
     })?;
-    let mut random = Random(11);
-    for size in SIZES {
-        let case = Case::new(size, &mut random);
+    let how = match options.ways.is_empty() {
+        true => format!("{:?}", options.matrices),
+        false => options.ways.join(", "),
+    };
+    for (case, twin) in cases() {
+        let size = (case.inputs, case.outputs, case.n);
         let products = ["y", "d_x", "d_weight", "d_bias"].into_iter();
-        for ((product, got), want) in products.zip(case.device(&gpu)?).zip(case.twin()) {
+        for ((product, got), want) in products.zip(case.device(&gpu)?).zip(twin) {
             let power: f64 = want.iter().map(|x| x * x).sum();
-            let error: f64 = got.iter().zip(&want).map(|(a, b)| (a - b).powi(2)).sum();
+            let error: f64 = got.iter().zip(want).map(|(a, b)| (a - b).powi(2)).sum();
             let distance = (error / power).sqrt();
-            println!("{matrices:?} {size:?} {product}: relative L2 {distance:.1e}");
-            assert!(distance <= most, "{size:?} {product}: {distance:e}");
+            println!("{how} {size:?} {product}: relative L2 {distance:.1e}");
+            assert!(distance <= most, "{how} {size:?} {product}: {distance:e}");
         }
     }
     let messages = gpu.validation_messages();
@@ -160,10 +179,44 @@ fn has_matrices() -> Result<bool> {
     Ok(there)
 }
 
+fn by(matrices: Matrices) -> GpuOptions {
+    GpuOptions {
+        matrices,
+        ..GpuOptions::default()
+    }
+}
+
 #[test]
 fn in_float32() -> Result<()> {
-    check(Matrices::Off, false, 1e-6)?;
-    check(Matrices::Off, true, 1e-6)
+    check(by(Matrices::Off), 1e-6)
+}
+
+#[test]
+fn in_float32_by_the_portable_kernels() -> Result<()> {
+    let options = GpuOptions {
+        portable: true,
+        ..by(Matrices::Off)
+    };
+    check(options, 1e-6)
+}
+
+/// Whichever way a device takes, narrow layers and wide ones.
+#[test]
+fn in_every_way_that_may_be_the_fastest() -> Result<()> {
+    let gpu = Gpu::new(&GpuOptions::default())?;
+    let ways: BTreeSet<String> = [64, 256]
+        .iter()
+        .flat_map(|&width| layer_ways(&gpu, width))
+        .collect();
+    assert!(ways.len() > 2, "{ways:?}");
+    for way in ways {
+        let options = GpuOptions {
+            ways: vec![way],
+            ..GpuOptions::default()
+        };
+        check(options, 1e-6)?;
+    }
+    Ok(())
 }
 
 #[test]
@@ -171,7 +224,7 @@ fn by_matrices_compensated() -> Result<()> {
     if !has_matrices()? {
         return Ok(());
     }
-    check(Matrices::Compensated, false, 1e-6)
+    check(by(Matrices::Compensated), 1e-6)
 }
 
 #[test]
@@ -179,7 +232,7 @@ fn by_matrices_of_float16() -> Result<()> {
     if !has_matrices()? {
         return Ok(());
     }
-    check(Matrices::Float16, false, 1e-3)
+    check(by(Matrices::Float16), 1e-3)
 }
 
 #[test]

@@ -11,6 +11,7 @@ use crate::reference::tape::ReluEdge;
 use crate::rig::{GradientRange, Rig, agreement};
 use neurodin::Result;
 use neurodin::config::{BiasReduction, Config};
+use neurodin::gpu::GpuOptions;
 use neurodin::scene::RegionShape;
 use neurodin::train::schedule::Schedule;
 
@@ -39,7 +40,7 @@ fn check(npz: &Npz, mut config: Config, stage: Stage) -> Result<()> {
     let published = golden::whole_step(npz);
     config.rays = published.rays.origins.len() as u32;
     config.loss.bias.reduction = BiasReduction::Published;
-    let rig = Rig::new(config, RegionShape::Sphere, false)?;
+    let rig = Rig::new(config, RegionShape::Sphere, GpuOptions::default())?;
     assert_eq!(rig.twin.samples, published.config.samples);
     assert_eq!(rig.twin.proposal_samples, published.config.proposal_samples);
 

@@ -5,6 +5,7 @@ use crate::rig::{Rig, write_npy};
 use glam::{DVec2, DVec3};
 use neurodin::Result;
 use neurodin::config::{BackgroundKind, Config};
+use neurodin::gpu::GpuOptions;
 use neurodin::render::TERMS;
 use neurodin::scene::synthetic::RADIUS;
 use neurodin::scene::{PriorPaths, RegionShape, Split, View};
@@ -61,7 +62,7 @@ fn a_models_own_depths_and_normals_cost_it_little() -> Result<()> {
     let bare = Rig::with(
         config.clone(),
         RegionShape::Sphere,
-        false,
+        GpuOptions::default(),
         &mut |scene, _| views.clone_from(&scene.views),
     )?;
     let own = (views.iter().enumerate())
@@ -78,7 +79,7 @@ fn a_models_own_depths_and_normals_cost_it_little() -> Result<()> {
         let mut rig = Rig::with(
             config.clone(),
             RegionShape::Sphere,
-            false,
+            GpuOptions::default(),
             &mut |scene, folder| {
                 for (index, view) in scene.views.iter_mut().enumerate() {
                     if view.split == Split::Test {

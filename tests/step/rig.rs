@@ -34,10 +34,10 @@ pub struct Rig {
 
 impl Rig {
     /// A trainer on a few small pictures of the built-in scene, under the validation layer, with guard words and poisoned scratch.
-    /// `portable`: by the kernels that run everywhere, also where this device has faster ones.
-    pub fn new(config: Config, shape: RegionShape, portable: bool) -> Result<Rig> {
+    /// `options` say by which kernels.
+    pub fn new(config: Config, shape: RegionShape, options: GpuOptions) -> Result<Rig> {
         let supervised = config.loss.is_supervised();
-        Rig::with(config, shape, portable, &mut |scene, folder| {
+        Rig::with(config, shape, options, &mut |scene, folder| {
             if supervised {
                 add_knowledge(scene, folder);
             }
@@ -48,7 +48,7 @@ impl Rig {
     pub fn with(
         config: Config,
         shape: RegionShape,
-        portable: bool,
+        options: GpuOptions,
         prepare: &mut dyn FnMut(&mut Scene, &Path),
     ) -> Result<Rig> {
         let folder = tempfile::tempdir().expect("a temporary folder");
@@ -73,9 +73,8 @@ impl Rig {
         let gpu = Gpu::new(&GpuOptions {
             guard: true,
             validation: true,
-            portable,
             matrices: config.matrices,
-            ..GpuOptions::default()
+            ..options
         })?;
         let trainer = Trainer::new(&gpu, &scene, &region, &config)?;
         let twin = twin_config(&config, &shape, trainer.model().n_views + 1);

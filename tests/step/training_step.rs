@@ -11,7 +11,7 @@ use glam::dvec3;
 use neurodin::Result;
 use neurodin::config::{BackgroundKind, BiasReduction, Config, MaskUse};
 use neurodin::gpu::{Gpu, GpuOptions, Matrices};
-use neurodin::model::Group;
+use neurodin::model::{Group, layer_ways};
 use neurodin::render::TERMS;
 use neurodin::scene::RegionShape;
 use neurodin::train::StepLosses;
@@ -34,7 +34,7 @@ fn preset(name: &str) -> Config {
 
 #[test]
 fn outdoors_with_one_background_color() -> Result<()> {
-    check(preset("outdoor-tiny"), RegionShape::Sphere, 9, false)
+    check(preset("outdoor-tiny"), RegionShape::Sphere, 9, usual())
 }
 
 /// The second stage of a preset.
@@ -50,12 +50,12 @@ fn second(name: &str) -> Config {
 
 #[test]
 fn second_stage_outdoors() -> Result<()> {
-    check(second("outdoor-tiny"), RegionShape::Sphere, 9, false)
+    check(second("outdoor-tiny"), RegionShape::Sphere, 9, usual())
 }
 
 #[test]
 fn second_stage_by_the_portable_kernels() -> Result<()> {
-    check(second("outdoor-tiny"), RegionShape::Sphere, 9, true)
+    check(second("outdoor-tiny"), RegionShape::Sphere, 9, portable())
 }
 
 #[test]
@@ -65,7 +65,7 @@ fn second_stage_indoors_with_other_features() -> Result<()> {
     config.hash.log2_size = 14;
     config.appearance.dims = 8;
     let half = dvec3(1.0, 0.8, 0.9);
-    check(config, RegionShape::Box { half }, 9, false)
+    check(config, RegionShape::Box { half }, 9, usual())
 }
 
 /// A single feature stands alone where all others stand in pairs.
@@ -74,7 +74,7 @@ fn both_stages_with_one_feature() -> Result<()> {
     for mut config in [preset("outdoor-tiny"), second("outdoor-tiny")] {
         config.hash.features = 1;
         config.rays = 100; // among fewer there is no bias to correct
-        check(config, RegionShape::Sphere, 9, false)?;
+        check(config, RegionShape::Sphere, 9, usual())?;
     }
     Ok(())
 }
@@ -82,17 +82,17 @@ fn both_stages_with_one_feature() -> Result<()> {
 /// Every density, scale and kind of gradient that the methods combine.
 #[test]
 fn laplace_density_of_one_beta_with_analytic_gradient() -> Result<()> {
-    check(method("volsdf-grid"), RegionShape::Sphere, 9, false)
+    check(method("volsdf-grid"), RegionShape::Sphere, 9, usual())
 }
 
 #[test]
 fn sight_density_of_one_beta() -> Result<()> {
-    check(method("tuvr-grid"), RegionShape::Sphere, 9, false)
+    check(method("tuvr-grid"), RegionShape::Sphere, 9, usual())
 }
 
 #[test]
 fn neus_opacity_with_analytic_gradient() -> Result<()> {
-    check(method("neus-grid"), RegionShape::Sphere, 9, false)
+    check(method("neus-grid"), RegionShape::Sphere, 9, usual())
 }
 
 #[test]
@@ -100,26 +100,62 @@ fn neus_opacity_with_four_taps_curvature_and_release() -> Result<()> {
     let config = method("neuralangelo");
     let now = Schedule::new(&config).at(STEP);
     assert!(now.released_levels < config.hash.levels && now.curvature_weight > 0.0);
-    check(config, RegionShape::Sphere, 9, false)
+    check(config, RegionShape::Sphere, 9, usual())
 }
 
 #[test]
 fn neus_opacity_with_six_taps_curvature_and_release() -> Result<()> {
-    check(method("neuralangelo-6"), RegionShape::Sphere, 9, false)
+    check(method("neuralangelo-6"), RegionShape::Sphere, 9, usual())
 }
 
 #[test]
 fn bias_correction_with_analytic_gradient() -> Result<()> {
-    check(method("ablation-b"), RegionShape::Sphere, 9, false)
+    check(method("ablation-b"), RegionShape::Sphere, 9, usual())
 }
 
 fn method(name: &str) -> Config {
     preset("outdoor-tiny").with_method(name).expect("a method")
 }
 
+/// The device's usual kernels.
+fn usual() -> GpuOptions {
+    GpuOptions::default()
+}
+
+/// The kernels that run everywhere, also where this device has faster ones.
+fn portable() -> GpuOptions {
+    GpuOptions {
+        portable: true,
+        ..usual()
+    }
+}
+
+/// Networks without loops, for devices that are slow in them.
+#[test]
+fn both_stages_by_straight_line_code() -> Result<()> {
+    for config in [preset("outdoor-tiny"), second("outdoor-tiny")] {
+        let ways = layer_ways(&Gpu::new(&usual())?, config.surface.hidden);
+        let ways: Vec<String> = ways
+            .into_iter()
+            .filter(|way| way.starts_with("straight"))
+            .collect();
+        if ways.is_empty() {
+            println!("skipped: this device is none for straight-line code");
+            return Ok(());
+        }
+        check(
+            config,
+            RegionShape::Sphere,
+            9,
+            GpuOptions { ways, ..usual() },
+        )?;
+    }
+    Ok(())
+}
+
 #[test]
 fn by_the_portable_kernels() -> Result<()> {
-    check(preset("outdoor-tiny"), RegionShape::Sphere, 9, true)
+    check(preset("outdoor-tiny"), RegionShape::Sphere, 9, portable())
 }
 
 /// Networks and layers are wide enough for them, and the matrices' operands keep what float16 drops: the bar is that of float32.
@@ -137,7 +173,7 @@ fn both_stages_by_compensated_matrices() -> Result<()> {
         config.matrices = Matrices::Compensated;
         config.hash.features = 4;
         config.hash.log2_size = 14;
-        check(config, RegionShape::Sphere, 9, false)?;
+        check(config, RegionShape::Sphere, 9, usual())?;
     }
     Ok(())
 }
@@ -148,7 +184,7 @@ fn indoors_in_a_box_with_the_published_bias_loss() -> Result<()> {
     config.rays = 100;
     config.loss.bias.reduction = BiasReduction::Published;
     let half = dvec3(1.0, 0.8, 0.9);
-    check(config, RegionShape::Box { half }, 9, false)
+    check(config, RegionShape::Box { half }, 9, usual())
 }
 
 #[test]
@@ -160,7 +196,7 @@ fn outdoors_with_a_background_field_and_appearance_codes() -> Result<()> {
     config.hash.log2_size = 14;
     config.background.samples = 12;
     config.background.max = 128;
-    check(config, RegionShape::Sphere, 9, false)
+    check(config, RegionShape::Sphere, 9, usual())
 }
 
 /// Large enough for a table of which a step leaves a part alone.
@@ -169,7 +205,7 @@ fn outdoors_with_a_table_that_is_updated_in_part() -> Result<()> {
     let mut config = preset("outdoor-tiny");
     config.hash.features = 4;
     config.hash.log2_size = 17;
-    check(config, RegionShape::Sphere, 9, false)
+    check(config, RegionShape::Sphere, 9, usual())
 }
 
 #[test]
@@ -180,7 +216,7 @@ fn with_the_widths_of_the_large_configurations() -> Result<()> {
     config.sampling.proposal_log2_size = 12;
     config.sampling.proposal_samples = [64, 48];
     config.background.log2_size = 12;
-    check(config, RegionShape::Sphere, 9, false)
+    check(config, RegionShape::Sphere, 9, usual())
 }
 
 /// A configuration with losses on masks, depths and normals.
@@ -202,21 +238,21 @@ fn with_distant_taps(mut config: Config) -> Config {
 #[test]
 fn with_masks_depths_and_normals() -> Result<()> {
     let config = with_distant_taps(supervised(preset("outdoor-tiny")));
-    check(config, RegionShape::Sphere, 9, false)
+    check(config, RegionShape::Sphere, 9, usual())
 }
 
 /// None of its samples lies on the surface where that is seen edge-on: f/|g·d| has a pole there, which a mask makes felt.
 #[test]
 fn second_stage_with_masks_depths_and_normals() -> Result<()> {
     let config = supervised(second("outdoor-tiny"));
-    check(config, RegionShape::Sphere, 9, false)
+    check(config, RegionShape::Sphere, 9, usual())
 }
 
 #[test]
 fn a_room_with_masks_depths_and_normals_by_the_portable_kernels() -> Result<()> {
     let half = dvec3(1.0, 0.8, 0.9);
     let config = with_distant_taps(supervised(preset("indoor-tiny")));
-    check(config, RegionShape::Box { half }, 9, true)
+    check(config, RegionShape::Box { half }, 9, portable())
 }
 
 /// Each alone: there is nothing of the others.
@@ -225,17 +261,17 @@ fn with_a_mask_or_normals_alone() -> Result<()> {
     let all = supervised(preset("outdoor-tiny"));
     let mut mask = preset("outdoor-tiny");
     (mask.scene.masks, mask.loss.mask) = (all.scene.masks, all.loss.mask);
-    check(mask, RegionShape::Sphere, 9, false)?;
+    check(mask, RegionShape::Sphere, 9, usual())?;
     let mut normals = with_distant_taps(preset("outdoor-tiny"));
     normals.loss.mono_normal = all.loss.mono_normal;
-    check(normals, RegionShape::Sphere, 9, false)
+    check(normals, RegionShape::Sphere, 9, usual())
 }
 
 #[test]
 fn evaluation_has_an_appearance_code_of_its_own() -> Result<()> {
     let mut config = preset("outdoor-tiny");
     config.appearance.dims = 8;
-    let rig = Rig::new(config, RegionShape::Sphere, false)?;
+    let rig = Rig::new(config, RegionShape::Sphere, usual())?;
     let model = rig.trainer.model();
     let codes = || -> Result<Vec<f64>> {
         Ok(rig.download_spans(model.params.values())?["appearance"].clone())
@@ -253,8 +289,8 @@ fn evaluation_has_an_appearance_code_of_its_own() -> Result<()> {
     rig.check_device()
 }
 
-fn check(config: Config, shape: RegionShape, seed: u64, portable: bool) -> Result<()> {
-    let mut rig = Rig::new(config, shape, portable)?;
+fn check(config: Config, shape: RegionShape, seed: u64, options: GpuOptions) -> Result<()> {
+    let mut rig = Rig::new(config, shape, options)?;
     for _ in 0..STEP {
         rig.trainer.step()?;
     }
