@@ -1,11 +1,11 @@
 //! A field's backward pass over more points than it takes at once, and over points with heads and without, is the sum of passes over
-//! fewer.
+//! fewer; and straight-line code makes the same of a field as loops do.
 
-use crate::harness::{assert_gradient, device};
+use crate::harness::assert_gradient;
 use neurodin::Result;
-use neurodin::gpu::Gpu;
+use neurodin::gpu::{Gpu, GpuOptions};
 use neurodin::model::{
-    Field, FieldBuffers, FieldShape, Group, HashGrid, Init, Params, ParamsPlan, Scratch,
+    Field, FieldBuffers, FieldShape, Group, HashGrid, Init, Params, ParamsPlan, Scratch, layer_ways,
 };
 
 const SHAPE: FieldShape = FieldShape {
@@ -16,7 +16,7 @@ const SHAPE: FieldShape = FieldShape {
         log2_size: 9,
         features: 2,
     },
-    hidden: 8,
+    hidden: 24,
     coordinates: true,
     softplus: true,
     gradient: true,
@@ -40,6 +40,21 @@ fn planes(of: u32, rows: usize, scale: f32, range: std::ops::Range<usize>) -> Ve
             .map(move |i| scale * noise(of, row * POINTS + i))
     })
     .collect()
+}
+
+/// A device of this test's own, so that all buffers that live have their guard words.
+fn open(ways: &[String]) -> Result<Gpu> {
+    Gpu::new(&GpuOptions {
+        validation: true,
+        guard: true,
+        ways: ways.to_vec(),
+        ..GpuOptions::default()
+    })
+}
+
+fn assert_valid(gpu: &Gpu) {
+    let messages = gpu.validation_messages();
+    assert!(messages.is_empty(), "{}", messages.join("\n"));
 }
 
 fn field(gpu: &Gpu) -> Result<(Field, Params)> {
@@ -100,12 +115,34 @@ fn backward(
         );
         Ok(())
     })?;
+    // While the buffers live: their guard words go with them.
+    gpu.finish()?;
+    let overruns = gpu.check_guards()?;
+    assert!(overruns.is_empty(), "written past an end: {overruns:?}");
     gpu.download(&d_points, 0, d_points.len())
+}
+
+fn wide(values: &[f32]) -> Vec<f64> {
+    values.iter().map(|&x| f64::from(x)).collect()
+}
+
+fn gradients(gpu: &Gpu, params: &Params) -> Result<Vec<f64>> {
+    let grads = params.grads();
+    gpu.download(grads, 0, grads.len()).map(|g| wide(&g))
+}
+
+/// Every span of parameters has heard something, and the same.
+fn assert_gradients(params: &Params, got: &[f64], want: &[f64]) {
+    for span in params.spans() {
+        let range = span.first as usize..(span.first + span.len()) as usize;
+        assert!(want[range.clone()].iter().any(|&g| g != 0.0));
+        assert_gradient(&span.name, &got[range.clone()], &want[range]);
+    }
 }
 
 #[test]
 fn many_points_are_the_sum_of_fewer() -> Result<()> {
-    let gpu = &device().gpu;
+    let gpu = &open(&[])?;
     let (whole, parts) = (field(gpu)?, field(gpu)?);
     let d_points = backward(gpu, &whole, 0..POINTS)?;
     let cut = 40_000;
@@ -113,7 +150,6 @@ fn many_points_are_the_sum_of_fewer() -> Result<()> {
         backward(gpu, &parts, 0..cut)?,
         backward(gpu, &parts, cut..POINTS)?,
     ];
-    let wide = |values: &[f32]| values.iter().map(|&x| f64::from(x)).collect::<Vec<f64>>();
     for axis in 0..3 {
         let joined = of_parts.iter().flat_map(|part| {
             let n = part.len() / 3;
@@ -123,15 +159,31 @@ fn many_points_are_the_sum_of_fewer() -> Result<()> {
         let row = &d_points[axis * POINTS..(axis + 1) * POINTS];
         assert_gradient("what the points hear", &wide(row), &wide(&joined));
     }
-    let [of_whole, of_parts] = [&whole.1, &parts.1].map(|params| {
-        let grads = params.grads();
-        gpu.download(grads, 0, grads.len()).map(|g| wide(&g))
-    });
-    let (of_whole, of_parts) = (of_whole?, of_parts?);
-    for span in whole.1.spans() {
-        let range = span.first as usize..(span.first + span.len()) as usize;
-        assert!(of_parts[range.clone()].iter().any(|&g| g != 0.0));
-        assert_gradient(&span.name, &of_whole[range.clone()], &of_parts[range]);
+    let of_parts = gradients(gpu, &parts.1)?;
+    assert_gradients(&whole.1, &gradients(gpu, &whole.1)?, &of_parts);
+    assert_valid(gpu);
+    Ok(())
+}
+
+#[test]
+fn straight_line_code_is_the_same_field() -> Result<()> {
+    let loops = &open(&[])?;
+    let ways = layer_ways(loops, SHAPE.hidden).into_iter();
+    let ways: Vec<String> = ways.filter(|way| way.starts_with("straight")).collect();
+    if ways.is_empty() {
+        println!("skipped: this device is none for straight-line code");
+        return Ok(());
     }
+    let straight = &open(&ways)?;
+    // Points with heads and without, of both a number that leaves a workgroup's last invocations without work.
+    let range = WITH_HEADS - 501..WITH_HEADS + 407;
+    let (of_loops, of_straight) = (field(loops)?, field(straight)?);
+    let want = backward(loops, &of_loops, range.clone())?;
+    let got = backward(straight, &of_straight, range)?;
+    assert_gradient("what the points hear", &wide(&got), &wide(&want));
+    let want = gradients(loops, &of_loops.1)?;
+    assert_gradients(&of_loops.1, &gradients(straight, &of_straight.1)?, &want);
+    assert_valid(loops);
+    assert_valid(straight);
     Ok(())
 }
