@@ -1,7 +1,7 @@
 #version 460
 // Weight and bias gradients of a layer: d_W[o, i] += Σ_n d_Y[o, n] X[i, n],  d_b[o] += Σ_n d_Y[o, n].
 // A workgroup sums up `chunk` samples in registers and touches memory once per entry; workgroups along x are chunks. Its lanes are outputs,
-// all of which ask for the same x, so that it costs one load; or with ROWS samples, of which each subgroup adds up its own.
+// all of which ask for the same x, so that it costs one load; or, with ROWS, samples, whose sums each subgroup adds up.
 #include "lib/prelude.glsl"
 #include "lib/sums.glsl"
 
