@@ -205,21 +205,28 @@ fn in_float32_by_the_portable_kernels() -> Result<()> {
     check(options, 1e-6)
 }
 
-/// Whichever way a device takes, narrow layers and wide ones.
+/// Whichever way a device takes, narrow layers and wide ones; by the portable kernels also what devices with many cores choose from.
 #[test]
 fn in_every_way_that_may_be_the_fastest() -> Result<()> {
-    let gpu = Gpu::new(&GpuOptions::default())?;
-    let ways: BTreeSet<String> = [64, 256]
-        .iter()
-        .flat_map(|&width| layer_ways(&gpu, width))
-        .collect();
-    assert!(ways.len() > 2, "{ways:?}");
-    for way in ways {
+    for portable in [false, true] {
         let options = GpuOptions {
-            ways: vec![way],
+            portable,
             ..GpuOptions::default()
         };
-        check(options, 1e-6)?;
+        let gpu = Gpu::new(&options)?;
+        let widths = [64, 256].iter();
+        let ways: BTreeSet<String> = widths.flat_map(|&width| layer_ways(&gpu, width)).collect();
+        assert!(ways.len() > 2, "{ways:?}");
+        for way in ways {
+            let ways = vec![way];
+            check(
+                GpuOptions {
+                    ways,
+                    ..options.clone()
+                },
+                1e-6,
+            )?;
+        }
     }
     Ok(())
 }
