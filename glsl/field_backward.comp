@@ -12,7 +12,7 @@
 layout(constant_id = 7) const uint HEADS = 1;  // as in field_forward
 layout(constant_id = 8) const uint SECOND_ORDER = 0;
 layout(constant_id = 9) const uint STRAIGHT = 0;
-#include "lib/straight.glsl"
+#include "lib/tile.glsl"
 
 layout(push_constant, scalar) uniform Args {
     F32s hidden_weight;      // [HIDDEN, INPUTS]
@@ -53,8 +53,7 @@ void main() {
     bool inside = point < end;
     uint p = inside ? point : begin;
     uint q = p - first;
-    float z[INPUTS];
-    [[unroll]] for (uint i = 0u; i < INPUTS; ++i) z[i] = inputs.at[i * n + p];
+    load_input(inputs, n, p);
     float z_dot[TANGENTS];
     if (SECOND_ORDER != 0u) {
         [[unroll]] for (uint i = 0u; i < TANGENTS; ++i) z_dot[i] = tangents.at[i * m + q];
@@ -68,11 +67,7 @@ void main() {
     uint first_neuron = 0u;
     [[unroll]] do {
         F32s weight = from(hidden_weight, first_neuron * INPUTS);
-        float u[TILE];
-        [[unroll]] for (uint t = 0u; t < TILE; ++t) u[t] = BIAS != 0u ? hidden_bias.at[first_neuron + t] : 0.0;
-        [[unroll]] for (uint i = 0u; i < INPUTS; ++i) {
-            [[unroll]] for (uint t = 0u; t < TILE; ++t) u[t] = fma(weight.at[t * INPUTS + i], z[i], u[t]);
-        }
+        preactivate(weight, from(hidden_bias, first_neuron));
         float s_dot[TILE];
         if (SECOND_ORDER != 0u) {
             [[unroll]] for (uint t = 0u; t < TILE; ++t) s_dot[t] = 0.0;

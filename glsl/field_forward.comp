@@ -12,7 +12,7 @@
 layout(constant_id = 7) const uint HEADS = 1;
 layout(constant_id = 8) const uint PART = 0;      // 0 everything, 1 the encoding of one level per slice, 2 the network
 layout(constant_id = 9) const uint STRAIGHT = 0;
-#include "lib/straight.glsl"
+#include "lib/tile.glsl"
 
 layout(push_constant, scalar) uniform Args {
     Levels levels;
@@ -62,19 +62,14 @@ void main() {
     F32s hidden_weight = hidden_weight, hidden_bias = hidden_bias, head_weight = head_weight;
     F32sMut hidden = hidden;
     uint n_hidden = n_hidden;
-    float z[INPUTS];
-    [[unroll]] for (uint i = 0u; i < INPUTS; ++i) z[i] = inputs.at[i * n + point];
+    load_input(reading(inputs), n, point);
 
     float sum = BIAS != 0u ? head_bias.at[0] : 0.0;
     uint neurons = turns(HIDDEN, n);
     uint first_neuron = 0u;
     [[unroll]] do {
         F32s weight = from(hidden_weight, first_neuron * INPUTS);
-        float u[TILE];
-        [[unroll]] for (uint t = 0u; t < TILE; ++t) u[t] = BIAS != 0u ? hidden_bias.at[first_neuron + t] : 0.0;
-        [[unroll]] for (uint i = 0u; i < INPUTS; ++i) {
-            [[unroll]] for (uint t = 0u; t < TILE; ++t) u[t] = fma(weight.at[t * INPUTS + i], z[i], u[t]);
-        }
+        preactivate(weight, from(hidden_bias, first_neuron));
         [[unroll]] for (uint t = 0u; t < TILE; ++t) {
             float h = activation(u[t]);
             sum = fma(head_weight.at[first_neuron + t], h, sum);

@@ -7,7 +7,7 @@
 #include "lib/field.glsl"
 
 layout(constant_id = 7) const uint STRAIGHT = 0;
-#include "lib/straight.glsl"
+#include "lib/tile.glsl"
 
 layout(push_constant, scalar) uniform Args {
     Levels levels;
@@ -27,19 +27,14 @@ void main() {
     uint point = item();
     if (STRAIGHT != 0u) point = min(point, n - 1u);
     else if (point >= n) return;
-    float z[INPUTS];
-    [[unroll]] for (uint i = 0u; i < INPUTS; ++i) z[i] = inputs.at[i * n + point];
+    load_input(inputs, n, point);
     float a[INPUTS];
     [[unroll]] for (uint i = 0u; i < INPUTS; ++i) a[i] = 0.0;
     uint neurons = turns(HIDDEN, n);
     uint first_neuron = 0u;
     [[unroll]] do {
         F32s weight = from(hidden_weight, first_neuron * INPUTS);
-        float u[TILE];
-        [[unroll]] for (uint t = 0u; t < TILE; ++t) u[t] = BIAS != 0u ? hidden_bias.at[first_neuron + t] : 0.0;
-        [[unroll]] for (uint i = 0u; i < INPUTS; ++i) {
-            [[unroll]] for (uint t = 0u; t < TILE; ++t) u[t] = fma(weight.at[t * INPUTS + i], z[i], u[t]);
-        }
+        preactivate(weight, from(hidden_bias, first_neuron));
         [[unroll]] for (uint t = 0u; t < TILE; ++t) u[t] = activation_derivative(u[t]) * head_weight.at[first_neuron + t];
         [[unroll]] for (uint i = 0u; i < INPUTS; ++i) {
             [[unroll]] for (uint t = 0u; t < TILE; ++t) a[i] = fma(weight.at[t * INPUTS + i], u[t], a[i]);
