@@ -22,7 +22,7 @@ layout(push_constant, scalar) uniform Args {
     F32s x;         // [INPUTS, n]
     F32s weight;    // forward [OUTPUTS, WEIGHT_COLUMNS], transposed [INPUTS, WEIGHT_COLUMNS]
     F32s bias;      // [OUTPUTS]
-    F32s gate;      // [OUTPUTS, n] post-ReLU values
+    F32s gate;      // [OUTPUTS, n] post-ReLU values; y may take their place
     F32sMut y;      // [OUTPUTS, n]
     uint n;
 };
@@ -39,8 +39,10 @@ void add_products(inout float sum[TILE], uint first, uint i0, const uint count, 
 }
 
 void main() {
-    // Invocations past the end do the last sample once more, and write what its own invocation writes.
+    // Invocations past the end do the last sample once more, and write what its own invocation writes; but where there is a gate, they
+    // may find y in its place already, and write nothing.
     uint sample_ = min(item(), n - 1u);
+    bool writes = GATED == 0u || item() < n;
     if (HELD != 0u) {
         [[unroll]] for (uint i = 0u; i < INPUTS; ++i) held[i] = x.at[i * n + sample_];
     }
@@ -61,7 +63,7 @@ void main() {
                 float value = activated(sum[t]);
                 uint at = (first + t) * n + sample_;
                 if (GATED != 0u && !(gate.at[at] > 0.0)) value = 0.0;
-                y.at[at] = value;
+                if (writes) y.at[at] = value;
             }
         }
     }
