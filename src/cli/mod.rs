@@ -197,10 +197,11 @@ pub fn main() -> ExitCode {
 
 /// `--color`, which the help itself obeys too, so that it is needed before everything is parsed.
 fn color_wanted() -> Color {
-    let mut words = std::env::args().skip(1);
+    let mut words = std::env::args_os().skip(1);
     while let Some(word) = words.next() {
+        let word = word.to_string_lossy();
         let value = match word.strip_prefix("--color") {
-            Some("") => words.next().unwrap_or_default(),
+            Some("") => words.next().unwrap_or_default().to_string_lossy().into(),
             Some(rest) => rest.trim_start_matches('=').to_string(),
             None => continue,
         };

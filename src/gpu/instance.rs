@@ -420,17 +420,18 @@ pub(super) fn choose(
     }
     let chosen = match wanted {
         Some(wanted) => {
-            let by_index = wanted
-                .parse::<usize>()
-                .ok()
-                .filter(|&index| index < devices.len());
-            let lower = wanted.to_lowercase();
-            let by_name = || {
-                devices
-                    .iter()
-                    .position(|(_, info)| info.name.to_lowercase().contains(&lower))
+            // Short numbers are of the list, long ones may be of a name.
+            let chosen = match wanted.parse::<usize>() {
+                Ok(index) if index < 100 => Some(index).filter(|&index| index < devices.len()),
+                _ if wanted.is_empty() => None,
+                _ => {
+                    let lower = wanted.to_lowercase();
+                    devices
+                        .iter()
+                        .position(|(_, info)| info.name.to_lowercase().contains(&lower))
+                }
             };
-            match by_index.or_else(by_name) {
+            match chosen {
                 Some(index) => index,
                 None => {
                     return no_device(format!(

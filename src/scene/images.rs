@@ -173,10 +173,25 @@ fn decode(path: &Path) -> Result<(RgbaImage, Orientation)> {
     if is_exr(path) {
         return Ok((decode_exr(path)?, Orientation::NoTransforms));
     }
+    if is_cut_off(path)? {
+        return Err(undecodable(
+            path,
+            &"the file ends in the middle of the picture",
+        ));
+    }
     let mut decoder = decoder(path)?;
     let orientation = decoder.orientation().unwrap_or(Orientation::NoTransforms);
     let image = DynamicImage::from_decoder(decoder).map_err(|error| undecodable(path, &error))?;
     Ok((image.into_rgba8(), orientation))
+}
+
+/// Whether a JPEG lacks its end, which decoders forgive and fill with grey: no end marker follows its last scan.
+fn is_cut_off(path: &Path) -> Result<bool> {
+    let data = std::fs::read(path).map_err(|source| Error::io(path, source))?;
+    let is = |marker: u8| move |pair: &[u8]| pair == [0xff, marker];
+    let last_scan = data.windows(2).rposition(is(0xda));
+    Ok(data.starts_with(&[0xff, 0xd8, 0xff])
+        && last_scan.is_some_and(|scan| !data[scan..].windows(2).any(is(0xd9))))
 }
 
 fn decode_exr(path: &Path) -> Result<RgbaImage> {

@@ -26,7 +26,7 @@ impl<'a> Document<'a> {
         let text = String::from_utf8_lossy(&data);
         let text = text.trim_start_matches('\u{feff}');
         let parsed = serde_json::from_str(text)
-            // Python writes NaN and Infinity, which JSON has not: as null they are found where they matter, with their key.
+            // Python writes NaN and Infinity, which JSON has not: as texts they are found where they matter, with their key.
             .or_else(|error| serde_json::from_str(&without_bare_words(text)).map_err(|_| error));
         match parsed {
             Ok(Value::Object(top)) => Ok(Document { file, top }),
@@ -111,8 +111,8 @@ impl<'a> Document<'a> {
             let entries =
                 entries.ok_or_else(|| format!("has a row {row} that is not 4 numbers"))?;
             for (column, entry) in entries.iter().enumerate() {
-                // Null is what NaN and Infinity were read as.
-                let number = if entry.is_null() {
+                // Texts are what NaN and Infinity were read as; some write null in their place.
+                let number = if entry.is_null() || entry.is_string() {
                     Some(f64::NAN)
                 } else {
                     entry.as_f64()
@@ -167,7 +167,7 @@ pub(super) fn find(
     Err(format!("no such file: {}", stated.display()))
 }
 
-/// `text` with NaN, Infinity and -Infinity outside of strings replaced by null.
+/// `text` with NaN, Infinity and -Infinity outside of strings in quotes.
 fn without_bare_words(text: &str) -> String {
     let mut cleaned = String::with_capacity(text.len());
     let (mut in_string, mut escaped) = (false, false);
@@ -177,7 +177,7 @@ fn without_bare_words(text: &str) -> String {
             .into_iter()
             .find(|word| !in_string && rest.starts_with(word));
         if let Some(word) = bare {
-            cleaned.push_str("null");
+            cleaned.push_str(&format!("\"{word}\""));
             rest = &rest[word.len()..];
             continue;
         }

@@ -51,28 +51,31 @@ impl RunDirectory {
     /// # Errors
     /// [`Error::Output`] if not.
     pub fn check_free(root: &Path, replace: bool) -> Result<()> {
-        let holds_something = |mut entries: fs::ReadDir| {
-            entries.any(|entry| entry.is_ok_and(|entry| entry.file_name() != LOCK))
-        };
-        let empty = match fs::read_dir(root).map(|entries| !holds_something(entries)) {
-            Ok(empty) => empty,
-            Err(error) if error.kind() == ErrorKind::NotFound => true,
+        let entries: Vec<fs::DirEntry> = match fs::read_dir(root).and_then(Iterator::collect) {
+            Ok(entries) => entries,
+            Err(error) if error.kind() == ErrorKind::NotFound => Vec::new(),
             Err(error) => return Err(Error::output(root, error.to_string(), "give another --out")),
         };
-        if empty || replace {
-            Ok(())
-        } else if root.join("config.toml").exists() {
-            Err(Error::output(
-                root,
+        let holds = |name: &str| entries.iter().any(|entry| entry.file_name() == name);
+        let refusal = |what: &str, next: &str| Err(Error::output(root, what, next));
+        match (holds(CONFIG) && holds(SCENE), replace) {
+            (true, true) => Ok(()),
+            (true, false) => refusal(
                 "holds a run already",
                 "go on with it by --resume, replace it by --force, or give another --out",
-            ))
-        } else {
-            Err(Error::output(
-                root,
+            ),
+            (false, _) if !holds(CONFIG) && entries.iter().all(is_of_a_start) => Ok(()),
+            (false, true) => match PARTS.iter().find(|part| holds(part)) {
+                Some(part) => refusal(
+                    &format!("holds '{part}', but no run that it could belong to"),
+                    "move it away, or give another --out: a run would take its place",
+                ),
+                None => Ok(()),
+            },
+            (false, false) => refusal(
                 "exists and is not empty",
                 "give another --out, or --force to write into it",
-            ))
+            ),
         }
     }
 
@@ -113,24 +116,24 @@ impl RunDirectory {
 
     /// The resolved configuration, commented.
     pub fn config(&self) -> PathBuf {
-        self.root.join("config.toml")
+        self.root.join(CONFIG)
     }
 
     /// Dataset, region and views.
     pub fn scene(&self) -> PathBuf {
-        self.root.join("scene.json")
+        self.root.join(SCENE)
     }
 
     pub fn log(&self) -> PathBuf {
-        self.root.join("log.jsonl")
+        self.root.join(LOG)
     }
 
     pub fn checkpoints(&self) -> PathBuf {
-        self.root.join("ckpt")
+        self.root.join(CHECKPOINTS)
     }
 
     pub fn previews(&self) -> PathBuf {
-        self.root.join("previews")
+        self.root.join(PREVIEWS)
     }
 
     /// The picture of a held-out view after so many steps.
@@ -167,6 +170,24 @@ fn remove(path: &Path, remove: impl Fn(&Path) -> std::io::Result<()>) -> Result<
             "give another --out",
         )),
         _ => Ok(()),
+    }
+}
+
+/// What a run's folder holds.
+const PARTS: [&str; 5] = [CONFIG, SCENE, LOG, CHECKPOINTS, PREVIEWS];
+const CONFIG: &str = "config.toml";
+const SCENE: &str = "scene.json";
+const LOG: &str = "log.jsonl";
+const CHECKPOINTS: &str = "ckpt";
+const PREVIEWS: &str = "previews";
+
+/// Whether this may be what a start leaves behind that was broken off before there was a configuration.
+fn is_of_a_start(entry: &fs::DirEntry) -> bool {
+    let is_empty = || fs::read_dir(entry.path()).is_ok_and(|mut inside| inside.next().is_none());
+    match entry.file_name().to_str() {
+        Some(CHECKPOINTS | PREVIEWS) => is_empty(),
+        Some(name) => name == LOCK || name == SCENE || name.ends_with(".part"),
+        None => false,
     }
 }
 
@@ -269,6 +290,13 @@ impl SceneRecord {
     /// What [`Scene::open`] fails with; [`Error::Input`] if it no longer holds the views that were trained with.
     pub fn open(&self, moved: Option<&Path>, config: &Config) -> Result<Scene> {
         let dataset = moved.unwrap_or(&self.dataset);
+        if moved.is_none() && !dataset.exists() {
+            return Err(Error::input(
+                dataset,
+                "is no longer there: the run was trained on it",
+                "name its new place: DATASET for `neurodin train --resume`, --dataset elsewhere",
+            ));
+        }
         let scene = Scene::open(dataset, &scene_options(config))?;
         let now = views(&scene);
         if now == self.views {
@@ -334,6 +362,7 @@ mod tests {
                 .contains("no run directory")
         );
         let run = RunDirectory::create(&root, false).unwrap();
+        run.write(&run.scene(), "{}").unwrap();
         run.write(&run.config(), "steps = 1\n").unwrap();
         fs::write(run.preview(5), b"png").unwrap();
         fs::write(root.join("notes.txt"), b"mine").unwrap();
@@ -354,5 +383,34 @@ mod tests {
             root.join("notes.txt").exists(),
             "what is not of a run stays"
         );
+    }
+
+    /// What a start left behind that was broken off is nobody's; what only looks like a run's is somebody else's.
+    #[test]
+    fn places_are_free_or_not() {
+        let folder = tempfile::tempdir().unwrap();
+        let begun = folder.path().join("begun");
+        let run = RunDirectory::create(&begun, false).unwrap();
+        run.write(&run.scene(), "{}").unwrap();
+        fs::write(begun.join("config.part"), b"ste").unwrap();
+        drop(run);
+        RunDirectory::create(&begun, false).unwrap();
+
+        let theirs = folder.path().join("theirs");
+        fs::create_dir_all(theirs.join("previews")).unwrap();
+        let picture = theirs.join("previews/mine.jpg");
+        fs::write(&picture, b"jpg").unwrap();
+        fs::write(theirs.join("config.toml"), b"mine = true").unwrap();
+        for replace in [false, true] {
+            let refused = RunDirectory::create(&theirs, replace).unwrap_err();
+            assert_eq!(refused.exit_code(), 8, "{refused}");
+        }
+        assert!(picture.exists() && theirs.join("config.toml").exists());
+
+        let other = folder.path().join("other");
+        fs::create_dir_all(&other).unwrap();
+        fs::write(other.join("notes.txt"), b"mine").unwrap();
+        assert!(RunDirectory::create(&other, false).is_err());
+        RunDirectory::create(&other, true).unwrap();
     }
 }

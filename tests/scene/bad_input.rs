@@ -179,6 +179,12 @@ fn poses_that_are_no_poses_are_refused_with_their_picture() {
         let dataset = rig.dataset(&json!({}));
         dataset.write("transforms.json", text);
         dataset.refuses(&["view_002.png", "NaN or infinity in row 0, column 3"]);
+        // Nor is it a setting that is absent.
+        for key in ["fl_x", "k1", "sphere_radius"] {
+            let text = rig.transforms(json!({ key: "HERE" })).to_string();
+            dataset.write("transforms.json", text.replace("\"HERE\"", word));
+            dataset.refuses(&["transforms.json", key, word]);
+        }
     }
 
     let mut mirrored = rig.transforms(json!({}));

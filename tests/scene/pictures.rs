@@ -229,6 +229,34 @@ fn intrinsics_follow_pictures_of_another_size() {
         .refuses(&["view_000.png", "64x48", "128x128"]);
 }
 
+/// Decoders fill what is missing with grey.
+#[test]
+fn jpegs_that_are_cut_off_are_refused() {
+    let rig = Rig::skewed(2);
+    let dataset = with_ending(&rig, "jpg");
+    for (name, _) in &rig.views {
+        let noise = image::RgbImage::from_fn(rig.width, rig.height, |x, y| {
+            image::Rgb([x * 97 ^ y * 61, x * 31 + y * 7, x * y].map(|value| value as u8))
+        });
+        let file = fs::File::create(dataset.at(&format!("images/{name}.jpg"))).unwrap();
+        JpegEncoder::new_with_quality(file, 90)
+            .encode_image(&noise)
+            .unwrap();
+    }
+    load(&dataset, 0);
+    let file = dataset.at(&format!("images/{}.jpg", rig.views[0].0));
+    let whole = fs::read(&file).unwrap();
+    for kept in [whole.len() * 2 / 3, whole.len() - 2] {
+        fs::write(&file, &whole[..kept]).unwrap();
+        let told = dataset.open().unwrap().load_picture(0).unwrap_err();
+        let told = told.to_string();
+        assert!(
+            told.contains("ends in the middle of the picture") && told.contains(".jpg"),
+            "{told}"
+        );
+    }
+}
+
 #[test]
 fn sideways_phone_pictures_are_turned_as_the_camera_says() {
     // Stored lying (48x64 as the camera has it, turned by EXIF orientation 6: the first row is on the right).
