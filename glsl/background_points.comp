@@ -1,6 +1,6 @@
 #version 460
 // Samples of the background field between a ray's exit point and `far` (METHOD 2.8): edges uniform in s with independent jitter,
-// disparity 1/t = s/far + (1 − s)/exit; positions at the midpoints. One ray per invocation.
+// disparity 1/t = s/far + (1 − s)/exit, `far` at least twice as far as the exit; positions at the midpoints. One ray per invocation.
 // With CONTRACTION, x ↦ (2 − 1/‖x‖) x/‖x‖ beyond the unit sphere and halved, so that all space falls into the hash grid's cube;
 // without, the published uncontracted positions, whose indices wrap.
 #include "lib/prelude.glsl"
@@ -26,7 +26,7 @@ float edge_at(uint ray, uint j, float exit) {
     float high = (min(float(j) + 0.5, float(n_samples))) / float(n_samples);
     float u = jittered != 0u ? draws.at[ray * (n_samples + 1u) + j] : 0.5;
     float s = jittered != 0u ? mix(low, high, u) : float(j) / float(n_samples);
-    return 1.0 / (s / far + (1.0 - s) / exit);
+    return 1.0 / (s / max(far, 2.0 * exit) + (1.0 - s) / exit);
 }
 
 void main() {

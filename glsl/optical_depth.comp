@@ -12,7 +12,7 @@ layout(push_constant, scalar) uniform Args {
     F32s directions;  // [3, n_rays] d
     F32s edges;       // [n_rays, n_samples + 1]
     F32s near_far;    // [2, n_rays]
-    U32s ray_outside; // [n_rays]
+    U32s ray_outside; // [n_rays] such rays are empty, whatever the network says
     F32sMut optical_depth; // [n] tau
     uint n_rays;
     uint n_samples;
@@ -20,7 +20,6 @@ layout(push_constant, scalar) uniform Args {
     float scale_floor;
     float inv_s_lower;  // the scheduled lower bound of the local 1/beta
     float anneal;       // of NeuS's cosine
-    uint outside_empty; // 1: rays outside the region are empty whatever the network says
 };
 
 void main() {
@@ -28,7 +27,7 @@ void main() {
     uint n = n_rays * n_samples;
     if (p >= n) return;
     uint ray = p / n_samples;
-    if (outside_empty != 0u && ray_outside.at[ray] != 0u) {
+    if (ray_outside.at[ray] != 0u) {
         optical_depth.at[p] = 0.0;
         return;
     }

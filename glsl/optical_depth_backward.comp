@@ -24,7 +24,6 @@ layout(push_constant, scalar) uniform Args {
     float scale_floor;
     float inv_s_lower;
     float anneal;
-    uint outside_empty;
 };
 
 void main() {
@@ -34,7 +33,7 @@ void main() {
     uint ray = p / n_samples;
     BinDepth depth = BinDepth(0.0, 0.0, 0.0, 0.0);
     Scale at = scale_of(scale.at[SCALE == SCALE_LOCAL ? p : 0u], scale_range, scale_floor, inv_s_lower);
-    if (outside_empty == 0u || ray_outside.at[ray] == 0u) {
+    if (ray_outside.at[ray] == 0u) {
         float c = DENSITY == DENSITY_LAPLACE ? 1.0 : cosine(gradient, directions, p, n, ray, n_rays);
         float bin = bin_length(ray_span(near_far, n_rays, ray), edges.at[p + ray], edges.at[p + ray + 1u]);
         depth = bin_depth(sdf.at[p], c, at.inv_s, bin, anneal);

@@ -5,6 +5,7 @@
 #include "lib/lazy_table.glsl"
 
 layout(constant_id = 0) const uint FEATURES = 2;
+layout(constant_id = 1) const uint TURNS = 64;  // pairs of parameters of an invocation: few workgroups where there is nothing to do
 
 layout(push_constant, scalar) uniform Args {
     Levels levels;
@@ -25,7 +26,6 @@ layout(push_constant, scalar) uniform Args {
 };
 
 const uint AT_ONCE = 4u;
-const uint TURNS = 64u;  // pairs of parameters of an invocation: few workgroups where there is nothing to do
 
 void main() {
     uint l = slice();

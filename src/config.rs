@@ -207,6 +207,8 @@ pub struct SurfaceConfig {
     pub tap_step: TapStepKind,
     /// Random taps lie U(0, tap_range) away, floored at a quarter of the finest cell of [0, 1]³.
     pub tap_range: f64,
+    /// What the range has become by the end of the schedule, by equal factors in equal times.
+    pub tap_range_end: f64,
 }
 
 impl SurfaceConfig {

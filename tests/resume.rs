@@ -125,6 +125,7 @@ fn deterministic_runs_are_the_same_to_the_bit() {
                 trainer.step().unwrap();
             }
             trainer.finish().unwrap();
+            assert_eq!(gpu.check_guards().unwrap(), []);
             let saved = trainer.save(&folder.path().join(stage).join(name)).unwrap();
             Checkpoint::open(&saved).unwrap()
         };
@@ -166,7 +167,6 @@ fn deterministic_runs_are_the_same_to_the_bit() {
         "{refused}"
     );
     for gpu in [fixed, floating] {
-        gpu.check_guards().unwrap();
         assert_eq!(gpu.validation_messages(), Vec::<String>::new());
     }
 }
@@ -240,6 +240,57 @@ fn losses_that_are_not_finite_lead_back_to_the_last_checkpoint() {
     assert_eq!(error.exit_code(), 7);
     let text = error.to_string();
     assert!(text.contains("not been finite for 10 steps"), "{text}");
+}
+
+/// What the second stage goes back to before its own first checkpoint is the end of the first stage: its parameters, but not its moments.
+#[test]
+fn a_second_stage_that_goes_back_begins_anew() {
+    let folder = tempfile::tempdir().unwrap();
+    let scene = scene(folder.path());
+    let settings = "deterministic = true\nsteps = 6\nrays = 16\nhash.levels = 4\nhash.log2_size = 17\nreport.preview_steps = 0";
+    let config = Config::preset("outdoor-tiny")
+        .and_then(|config| config.with_toml(settings, "test"))
+        .unwrap();
+    let gpu = Gpu::new(&GpuOptions {
+        deterministic: true,
+        ..GpuOptions::default()
+    })
+    .unwrap();
+    let run = RunDirectory::create(&folder.path().join("run"), false).unwrap();
+    let mut first = Trainer::new(&gpu, &scene, &sphere(1.1), &config).unwrap();
+    first.run(&scene, &run, &mut |_| Control::Continue).unwrap();
+    let mut second = first.next_stage(&scene, &run).unwrap().unwrap();
+    let begin = second.steps_done();
+    second.step().unwrap();
+    let straight = second.save(&folder.path().join("straight")).unwrap();
+    let end_of_first = neurodin::train::checkpoint::latest(&run.checkpoints()).unwrap();
+    second.begin_from(&end_of_first.checkpoint).unwrap();
+
+    let params = &second.model().params;
+    gpu.upload(params.values(), 0, &[f32::NAN]).unwrap();
+    let mut back = false;
+    let mut tell = |event: Event| {
+        back |= matches!(event, Event::Warning { .. });
+        match back && matches!(event, Event::Advanced { .. }) {
+            true => Control::Stop,
+            false => Control::Continue,
+        }
+    };
+    let stopped = second.run(&scene, &run, &mut tell).unwrap_err();
+    assert_eq!(stopped.exit_code(), 130, "{stopped}");
+    let newest = neurodin::train::checkpoint::latest(&run.checkpoints()).unwrap();
+    let (back, straight) = (newest.checkpoint, Checkpoint::open(&straight).unwrap());
+    assert_eq!(back.state().step, begin + 1);
+    assert_eq!(straight.state().step, begin + 1);
+    for span in ["surface.table", "surface.hidden.v", "proposal.0.table"] {
+        for moment in ["first_moment", "second_moment"] {
+            let name = format!("{moment}.{span}");
+            let [(_, back), (_, straight)] =
+                [&back, &straight].map(|checkpoint| checkpoint.tensor(&name).unwrap());
+            assert!(straight.iter().any(|&x| x != 0.0), "{name}");
+            assert!(back == straight, "{name}");
+        }
+    }
 }
 
 #[test]

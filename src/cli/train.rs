@@ -497,13 +497,15 @@ impl Teller<'_> {
                 return self.answer();
             }
             Event::Step { losses, psnr, .. } => {
-                let optional: String = losses
-                    .optional()
-                    .map(|(name, value)| format!(", {} {value:.5}", name.replace('_', " ")))
+                let parts: Vec<String> = losses
+                    .parts
+                    .iter()
+                    .map(|(name, value)| format!("{} {value:.5}", name.replace('_', " ")))
                     .collect();
                 self.note = format!(
-                    "loss {:.4} (colour {:.4}, eikonal {:.4}, bias {:.5}, proposal {:.5}{optional})  {psnr:.2} dB",
-                    losses.total, losses.color, losses.eikonal, losses.bias, losses.interlevel
+                    "loss {:.4} ({})  {psnr:.2} dB",
+                    losses.total,
+                    parts.join(", ")
                 );
                 String::new()
             }

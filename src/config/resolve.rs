@@ -178,7 +178,8 @@ impl Config {
         let table = Table::try_from(self).expect("a configuration is a table");
         let source = format!("method {name}");
         let mut config = overlay(table, &parse(method.toml, &source)?, &source)?;
-        if config.stage2.steps == 0 {
+        // A method of one stage has all steps in it; a second stage is as long as it is.
+        if config.stage2.steps == 0 && config.first_step == 0 {
             config.steps = match full_length {
                 true => config.schedule_steps,
                 false => total,
@@ -670,6 +671,8 @@ mod tests {
             (1501, 500, 0)
         );
         assert_eq!(second.total_steps(), 2001);
+        let again = second.clone().with_method("neurodin").unwrap();
+        assert_eq!(again.steps, 500, "a method does not lengthen it");
         // Lengthened when it has begun, only what is left of it can be.
         assert_eq!(second.with_total_steps(3001).steps, 1500);
         let mut first_only = both;

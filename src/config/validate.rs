@@ -56,6 +56,12 @@ impl Config {
         }
         wrong.real("surface.tap_range", self.surface.tap_range, 1e-6, 1.0);
         wrong.real(
+            "surface.tap_range_end",
+            self.surface.tap_range_end,
+            1e-6,
+            1.0,
+        );
+        wrong.real(
             "loss.curvature.weight",
             self.loss.curvature.weight,
             0.0,

@@ -371,11 +371,12 @@ mod tests {
     use crate::gpu::device::Inner;
 
     #[test]
-    fn every_kernel_builds_in_both_variants_and_the_layer_agrees() -> Result<()> {
-        for portable in [false, true] {
+    fn every_kernel_builds_in_every_variant_and_the_layer_agrees() -> Result<()> {
+        for (portable, deterministic) in [(false, false), (false, true), (true, false)] {
             let options = GpuOptions {
                 validation: true,
                 portable,
+                deterministic,
                 ..GpuOptions::default()
             };
             let gpu = Gpu::new(&options)?;
@@ -390,7 +391,7 @@ mod tests {
                 .filter_map(|module| module.cooperative)
                 .filter(|_| info.matrix.is_some());
             for module in crate::kernels::ALL.iter().copied().chain(with_matrices) {
-                let pipeline = pipelines.build(context, info, module, &[], false)?;
+                let pipeline = pipelines.build(context, info, module, &[], deterministic)?;
                 // SAFETY: nothing uses it.
                 unsafe { context.device.destroy_pipeline(pipeline, None) };
                 assert_eq!(

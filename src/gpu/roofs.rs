@@ -75,7 +75,6 @@ impl Gpu {
 
     /// Measures the rates of tables of these sizes, in about a second each.
     pub fn measure_tables(&self, log2_entries: &[u32]) -> Result<Vec<TableRoofs>> {
-        const ENTRIES_PER_INVOCATION: f64 = 16.0;
         let launched = match self.info().kind {
             DeviceKind::Cpu | DeviceKind::Other => 1u64 << 14,
             _ => 1 << 20,
@@ -83,9 +82,14 @@ impl Gpu {
         let largest = log2_entries.iter().copied().max().unwrap_or(0);
         let table = self.buffer::<f32>("roof table", 8 << largest)?;
         let sums = self.buffer::<f32>("roof sums", launched)?;
-        let gather = self.kernel(roof_gather::Shape::default())?;
-        let scatter = self.kernel(roof_scatter::Shape::default())?;
-        let rate = |seconds: f64| launched as f64 * ENTRIES_PER_INVOCATION / seconds * 1e-6;
+        let (gathers, scatters) = (
+            roof_gather::Shape::default(),
+            roof_scatter::Shape::default(),
+        );
+        let gather = self.kernel(gathers)?;
+        let scatter = self.kernel(scatters)?;
+        let rate =
+            |entries: u32, seconds: f64| launched as f64 * f64::from(entries) / seconds * 1e-6;
         let mut measured = Vec::new();
         for &log2_entries in log2_entries {
             let mask = (1u32 << log2_entries) - 1;
@@ -108,8 +112,8 @@ impl Gpu {
             })?;
             measured.push(TableRoofs {
                 log2_entries,
-                gather_m_s: rate(gathered),
-                scatter_m_s: rate(scattered),
+                gather_m_s: rate(gathers.entries, gathered),
+                scatter_m_s: rate(scatters.entries, scattered),
             });
         }
         Ok(measured)

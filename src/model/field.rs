@@ -423,8 +423,7 @@ impl Field {
         points: Ptr<f32>,
         buffers: &FieldBuffers,
     ) {
-        let unused = buffers.inputs.ptr_mut();
-        let args = self.forward_args(params, points, buffers, unused, 0..buffers.n);
+        let args = self.forward_args(params, points, buffers, PtrMut::NULL, 0..buffers.n);
         let levels = f64::from(self.shape.grid.levels);
         let work = Work::items(u64::from(buffers.n))
             .slices(self.shape.grid.levels)
@@ -609,8 +608,7 @@ impl Field {
                 slope.slopes.ptr().offset(coordinates * u64::from(n)),
                 slope.d_gradient.ptr(),
             ),
-            // Nobody reads them.
-            None => (points, points),
+            None => (Ptr::NULL, Ptr::NULL),
         };
         let d_table = pass.params.d_value(self.table);
         let levels = self.levels.ptr();

@@ -214,7 +214,7 @@ impl Layer {
             x,
             weight: params.weight(self.handle, self.weight_offset()),
             bias: params.bias(self.handle, u64::from(self.first_row)),
-            gate: x,
+            gate: Ptr::NULL,
             y,
             n,
         };
@@ -238,7 +238,7 @@ impl Layer {
         let args = linear::Args {
             x: d_y,
             weight: params.weight(self.handle, self.weight_offset()),
-            bias: params.bias(self.handle, 0),
+            bias: Ptr::NULL,
             gate: x,
             y: d_x,
             n,

@@ -50,23 +50,26 @@ pub struct LazyTable {
     touch: Kernel<table_touch::Args>,
     update: Kernel<table_update::Args>,
     update_whole: Kernel<table_update_whole::Args>,
+    /// Parameters that a workgroup of `update_whole` goes over.
+    of_group: u64,
     tick: Kernel<table_clock::Args>,
     catch_up: Kernel<table_flush::Args>,
 }
 
 /// Readings of the clock.
 const READINGS: u64 = 256;
-/// Parameters of a workgroup in glsl/table_update_whole.comp.
-const WHOLE_GROUP: u64 = 64 * 128;
 /// Marks in a word.
 const WORD: u64 = 32;
 /// Marking an entry costs about as much as updating so many parameters: a level that a step looks at more often than it has such
 /// parameters is better updated whole.
 const VISIT: u64 = 4;
 
+/// Below it, β₂ to the power of as many steps as an entry may be left alone for is no longer a float32.
+const LEAST_BETA2: f64 = 0.75;
+
 impl LazyTable {
     /// The table of a grid that a training step asks at `points`, at an element offset of the parameter block; nothing is touched or
-    /// behind at first. `None` where every level is better updated whole.
+    /// behind at first. `None` where every level is better updated whole, or β₂ is so small that it has to be.
     pub fn new(
         gpu: &Gpu,
         grid: &HashGrid,
@@ -82,6 +85,9 @@ impl LazyTable {
         let (Some(first), Some(last)) = (rows.first(), rows.last()) else {
             return Ok(None);
         };
+        if optimizer.beta2 < LEAST_BETA2 {
+            return Ok(None);
+        }
         let n_levels = rows.len() as u32;
         let end = u64::from(last.offset) + u64::from(last.entries);
         let slots = (end / WORD + u64::from(n_levels) + 1) * WORD;
@@ -91,6 +97,11 @@ impl LazyTable {
             true => (16, 0.35),
             false => (2, 0.65),
         };
+        let whole = table_update_whole::Shape {
+            features,
+            ..table_update_whole::Shape::default()
+        };
+        let update_whole = gpu.kernel(whole)?;
         let levels = gpu.buffer("lazy levels", u64::from(n_levels))?;
         gpu.upload(&levels, 0, &rows)?;
         Ok(Some(LazyTable {
@@ -115,7 +126,8 @@ impl LazyTable {
                 features,
             })?,
             update: gpu.kernel(table_update::Shape { features, strip })?,
-            update_whole: gpu.kernel(table_update_whole::Shape { features })?,
+            of_group: 2 * u64::from(whole.turns) * u64::from(update_whole.local_size()),
+            update_whole,
             tick: gpu.kernel(table_clock::Shape { levels: n_levels })?,
             catch_up: gpu.kernel(table_flush::Shape { features })?,
         }))
@@ -214,8 +226,8 @@ impl LazyTable {
             share2: self.share2,
             epsilon: self.epsilon,
         };
-        let groups = (self.most_entries * u64::from(self.features)).div_ceil(WHOLE_GROUP);
-        let of_group = WHOLE_GROUP as f64 / 8.0;
+        let groups = (self.most_entries * u64::from(self.features)).div_ceil(self.of_group);
+        let of_group = self.of_group as f64 / 8.0; // most levels are not whole
         let work = Work::groups(groups).slices(self.n_levels);
         rec.run(
             &self.update_whole,

@@ -252,10 +252,10 @@ fn upload_uniform(
     Ok(())
 }
 
-/// A uniform in [0, 1) as a function of (seed, index): SplitMix64's finaliser on their combination (Steele et al. 2014).
+/// A uniform in [0, 1) as a function of (seed, index < 2³²): SplitMix64's finaliser on their combination (Steele et al. 2014).
 pub(super) fn uniform(seed: u32, index: u64) -> f64 {
     let mut x = index
-        .wrapping_add(u64::from(seed) << 40)
+        .wrapping_add(u64::from(seed.rotate_left(8)) << 32)
         .wrapping_add(1)
         .wrapping_mul(0x9e37_79b9_7f4a_7c15);
     x = (x ^ (x >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
@@ -400,15 +400,19 @@ impl Params {
         }
     }
 
-    /// Bias values (any valid address where the layer has none; its kernels do not look).
+    /// Bias values; nowhere if the layer has none.
     pub fn bias(&self, handle: WeightHandle, offset: u64) -> Ptr<f32> {
-        self.values
-            .ptr()
-            .offset(handle.bias.map_or(0, |first| first + offset))
+        match handle.bias {
+            Some(first) => self.values.ptr().offset(first + offset),
+            None => Ptr::NULL,
+        }
     }
 
-    /// Where the bias's gradient is accumulated.
+    /// Where the bias's gradient is accumulated; nowhere if the layer has none.
     pub fn d_bias(&self, handle: WeightHandle, offset: u64) -> PtrMut<f32> {
-        self.d_value(handle.bias.map_or(0, |first| first + offset))
+        match handle.bias {
+            Some(first) => self.d_value(first + offset),
+            None => PtrMut::NULL,
+        }
     }
 }

@@ -344,13 +344,12 @@ impl Surface {
     ) {
         self.field
             .forward(rec, params, b.points.ptr(), &b.field, b.sdf.ptr_mut());
-        // Nobody reads it where there are taps.
         let gradient = match self.field.shape.gradient {
             true => {
                 self.field.gradient(rec, params, b.points.ptr(), &b.field);
                 b.field.slope().gradient.ptr()
             }
-            false => b.sdf.ptr(),
+            false => Ptr::NULL, // the kernel takes it from the taps
         };
         self.heads
             .forward(rec, params, b.field.hidden.ptr(), b.shading.ptr_mut(), b.n);
@@ -512,12 +511,12 @@ impl Surface {
         b.shading.ptr().offset(self.gradient_row(b))
     }
 
-    /// Where what the gradient hears from elsewhere than shading is to be written, `[3, n]`; any valid address where nobody listens.
+    /// Where what the gradient hears from elsewhere than shading is to be written, `[3, n]`; nowhere if nothing else does.
     pub fn d_gradient(&self, b: &SurfaceBuffers) -> PtrMut<f32> {
         match (&b.tap_d_gradient, self.field.shape.gradient) {
             (Some(of_taps), _) => of_taps.ptr_mut(),
             (None, true) => b.field.slope().d_gradient.ptr_mut(),
-            (None, false) => b.d_sdf.ptr_mut(),
+            (None, false) => PtrMut::NULL,
         }
     }
 }

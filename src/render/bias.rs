@@ -124,7 +124,6 @@ pub fn on_plane(gpu: &Gpu, density: DensityKind, cosines: &[f64]) -> Result<Vec<
             scale_floor: 0.0,
             inv_s_lower: 0.0,
             anneal: 1.0,
-            outside_empty: 0,
         };
         rec.run(&optical_depth, Work::items(count as u64), args);
         let args = composite_forward::Args {

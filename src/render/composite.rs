@@ -4,8 +4,8 @@ use super::rays::Rays;
 use super::renderer::Annealed;
 use super::sampler::Sampler;
 use crate::Result;
-use crate::config::{BackgroundKind, Config, DensityKind, ScaleKind};
-use crate::gpu::{Buffer, Gpu, Kernel, Recorder, Work};
+use crate::config::{Config, DensityKind, ScaleKind};
+use crate::gpu::{Buffer, Gpu, Kernel, Ptr, Recorder, Work};
 use crate::kernels::{
     composite_backward, composite_forward, normal_map, normal_map_backward, optical_depth,
     optical_depth_backward,
@@ -27,7 +27,6 @@ pub struct Composite {
     optical_depth_backward: Kernel<optical_depth_backward::Args>,
     scale_range: f32,
     scale_floor: f32,
-    outside_empty: u32,
 }
 
 /// Everything that compositing reads of a batch.
@@ -74,7 +73,6 @@ impl Composite {
                 _ => config.surface.scale_max,
             } as f32,
             scale_floor: config.surface.scale_floor as f32,
-            outside_empty: u32::from(config.background.kind != BackgroundKind::None),
         })
     }
 
@@ -97,7 +95,6 @@ impl Composite {
             scale_floor: self.scale_floor,
             inv_s_lower: look.now.inv_s_lower,
             anneal: look.now.cosine_anneal,
-            outside_empty: self.outside_empty,
         };
         rec.run(&self.optical_depth_forward, per_sample(n, n_samples), args);
         let args = composite_forward::Args {
@@ -135,7 +132,7 @@ impl Composite {
             near_far: look.rays.near_far.ptr(),
             image: self.image.ptr(),
             gradient: model.surface.gradient(surface),
-            d_image: d_image.unwrap_or(d_color).ptr(), // not read where there is none
+            d_image: d_image.map_or(Ptr::NULL, Buffer::ptr),
             // Left where the SDF's own gradient will take its place.
             d_optical_depth: surface.d_sdf.ptr_mut(),
             d_rgb: surface.d_rgb.ptr_mut(),
@@ -161,7 +158,6 @@ impl Composite {
             scale_floor: self.scale_floor,
             inv_s_lower: look.now.inv_s_lower,
             anneal: look.now.cosine_anneal,
-            outside_empty: self.outside_empty,
         };
         rec.run(&self.optical_depth_backward, per_sample(n, n_samples), args);
         // Added to what optical_depth_backward wrote.

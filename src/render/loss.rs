@@ -2,6 +2,7 @@
 
 use super::composite::{Composite, Look};
 use super::priors::Priors;
+use super::renderer::Renderer;
 use super::supervision::Supervision;
 use super::tangent::Tangent;
 use crate::Result;
@@ -10,8 +11,8 @@ use crate::gpu::{Buffer, Gpu, Kernel, Ptr, Recorder, Work};
 use crate::kernels::{LossTerm, bias_correction, color_loss, heaviest_sample, sum_losses};
 use crate::model::{FieldBuffers, Model, Scratch, Surface};
 
-/// Names of the summed terms, in order; the total of all but the last two, which are figures for the log, follows as the last number.
-pub const TERMS: [&str; 13] = [
+/// Names of the summed terms, in order; the total of all but the last three, which are figures for the log, follows as the last number.
+pub const TERMS: [&str; 14] = [
     "color",
     "eikonal",
     "interlevel_0",
@@ -23,7 +24,8 @@ pub const TERMS: [&str; 13] = [
     "sensor_depth",
     "mono_depth",
     "mono_normal",
-    "mse",
+    "square_error",
+    "pixel_weight",
     "crossing",
 ];
 
@@ -44,6 +46,9 @@ pub struct Loss {
     d_query_sdf: Buffer<f32>, // [2, n_rays]
     pub tangent: Option<Tangent>,
     pub supervision: Option<Supervision>,
+    /// What the gradients of a sample's eikonal and of a ray's interlevel losses are to be multiplied by, as their sums are.
+    pub eikonal_scale: f32,
+    pub interlevel_scale: f32,
     terms: Buffer<LossTerm>,
     color_loss: Kernel<color_loss::Args>,
     heaviest_sample: Kernel<heaviest_sample::Args>,
@@ -57,20 +62,18 @@ pub struct Loss {
     n_samples: u32,
 }
 
-/// Weights of the loss terms that are constant.
-#[derive(Clone, Copy, Debug)]
-pub struct LossScales {
-    pub eikonal: f32,
-    pub interlevel: f32,
-    pub tangent: f32,
-}
-
 impl Loss {
-    /// Buffers and kernels for a batch of rays, with the priors that its losses ask for.
-    pub fn new(gpu: &Gpu, config: &Config, n_rays: u32, priors: Option<Priors>) -> Result<Loss> {
+    /// Buffers and kernels for the renderer's batches of rays, with the priors that its losses ask for.
+    pub fn new(
+        gpu: &Gpu,
+        config: &Config,
+        renderer: &Renderer,
+        priors: Option<Priors>,
+    ) -> Result<Loss> {
+        let (n_rays, n_samples) = (config.rays, config.sampling.samples);
         let n = u64::from(n_rays);
         let bias = &config.loss.bias;
-        Ok(Loss {
+        let loss = Loss {
             d_color: gpu.scratch("d_color", 3 * n)?,
             sums: gpu.buffer("losses", TERMS.len() as u64 + 1)?,
             bad_step: gpu.buffer("bad step", 1)?,
@@ -90,8 +93,10 @@ impl Loss {
             )?,
             query_sdf: gpu.scratch("bias sdf", 2 * n)?,
             d_query_sdf: gpu.scratch("bias d_sdf", 2 * n)?,
-            tangent: Tangent::new(gpu, config, n_rays * config.sampling.samples)?,
+            tangent: Tangent::new(gpu, config, n_rays * n_samples)?,
             supervision: Supervision::new(gpu, config, n_rays, priors)?,
+            eikonal_scale: config.loss.eikonal as f32 / (n_rays * n_samples) as f32,
+            interlevel_scale: config.loss.interlevel as f32 / n_rays as f32,
             terms: gpu.buffer("loss terms", TERMS.len() as u64)?,
             color_loss: gpu.kernel(color_loss::Shape::default())?,
             heaviest_sample: gpu.kernel(heaviest_sample::Shape::default())?,
@@ -102,8 +107,10 @@ impl Loss {
             published: u32::from(bias.reduction == BiasReduction::Published),
             need_opaque: u32::from(!config.surface.inside_out),
             n_rays,
-            n_samples: config.sampling.samples,
-        })
+            n_samples,
+        };
+        gpu.upload(&loss.terms, 0, &loss.terms_of(config, renderer))?;
+        Ok(loss)
     }
 
     /// Colour loss and its gradient.
@@ -191,55 +198,54 @@ impl Loss {
         );
     }
 
-    /// The table of what to sum. `weights` scale the terms as they enter the total.
-    pub fn set_terms(
-        &self,
-        gpu: &Gpu,
-        eikonal: &Buffer<f32>,
-        interlevel: &[Buffer<f32>],
-        curvature: Option<&Buffer<f32>>,
-        weights: LossScales,
-    ) -> Result<()> {
-        let per_ray = 1.0 / self.n_rays as f32;
-        let term = |values: Ptr<f32>, count: u32, scale: f32, counts: u32| LossTerm {
-            values,
+    /// The table of what to sum, in the order of [`TERMS`].
+    fn terms_of(&self, config: &Config, renderer: &Renderer) -> [LossTerm; TERMS.len()] {
+        let (n, n_all) = (self.n_rays, self.n_rays * self.n_samples);
+        let term = |values: &Buffer<f32>, count: u32, scale: f32| LossTerm {
+            values: values.ptr(),
             count,
             scale,
-            counts,
+            counts: 1,
             padding: 0,
         };
-        let n = self.n_rays;
-        let n_all = n * self.n_samples;
-        let none = term(self.bias.ptr(), 0, 0.0, 1);
+        let none = term(&self.bias, 0, 0.0);
+        let figure = |values: Ptr<f32>| LossTerm {
+            values,
+            count: n,
+            scale: 1.0 / n as f32,
+            counts: 0,
+            padding: 0,
+        };
         let [mask, sensor_depth, mono_depth, mono_normal] = match &self.supervision {
             Some(supervision) => supervision.terms().map(|of| match of {
-                Some((values, scale)) => term(values.ptr(), n, scale, 1),
+                Some((values, scale)) => term(values, n, scale),
                 None => none,
             }),
             None => [none; 4],
         };
-        let terms = [
-            term(self.color.ptr(), n, per_ray, 1),
-            term(eikonal.ptr(), n_all, weights.eikonal / n_all as f32, 1),
-            term(interlevel[0].ptr(), n, weights.interlevel * per_ray, 1),
-            term(interlevel[1].ptr(), n, weights.interlevel * per_ray, 1),
-            term(self.bias.ptr(), n, 1.0, 1), // weighted where it is computed: its weight changes with time
+        let (surface, interlevel) = (&renderer.surface, &renderer.sampler.interlevel_loss);
+        [
+            term(&self.color, n, 1.0 / n as f32),
+            term(&surface.eikonal, n_all, self.eikonal_scale),
+            term(&interlevel[0], n, self.interlevel_scale),
+            term(&interlevel[1], n, self.interlevel_scale),
+            term(&self.bias, n, 1.0), // weighted where it is computed: its weight changes with time
             match &self.tangent {
-                Some(tangent) => term(tangent.loss.ptr(), n_all, weights.tangent / n_all as f32, 1),
+                Some(tangent) => term(&tangent.loss, n_all, tangent.scale),
                 None => none,
             },
-            match curvature {
-                Some(curvature) => term(curvature.ptr(), n_all, 1.0, 1), // weighted likewise
-                None => none,
+            match config.loss.curvature.weight > 0.0 {
+                true => term(&surface.curvature, n_all, 1.0), // weighted likewise
+                false => none,
             },
             mask,
             sensor_depth,
             mono_depth,
             mono_normal,
-            term(self.square.ptr(), n, per_ray, 0),
-            term(self.gate.ptr(), n, per_ray, 0),
-        ];
-        gpu.upload(&self.terms, 0, &terms)
+            figure(self.square.ptr()),
+            figure(renderer.rays.target.ptr().offset(3 * u64::from(n))),
+            figure(self.gate.ptr()),
+        ]
     }
 
     /// Sums all terms in a fixed order, into `self.sums`, and flags a sum that is not finite.

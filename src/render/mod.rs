@@ -11,7 +11,7 @@ mod supervision;
 mod tangent;
 
 pub use composite::{Composite, Look};
-pub use loss::{Loss, LossScales, TERMS};
+pub use loss::{Loss, TERMS};
 pub use priors::Priors;
 pub use rays::{RayDraws, Rays, ViewTable};
 pub use renderer::{Annealed, Rendered, Renderer, Shot, TRAINING};

@@ -18,7 +18,8 @@ pub struct Tangent {
     place: Kernel<tangent_points::Args>,
     compare: Kernel<tangent_loss::Args>,
     place_backward: Kernel<tangent_points_backward::Args>,
-    weight: f32,
+    /// What the gradient of a sample's loss is to be multiplied by, as their sum is.
+    pub scale: f32,
 }
 
 impl Tangent {
@@ -37,7 +38,7 @@ impl Tangent {
             place: gpu.kernel(tangent_points::Shape::default())?,
             compare: gpu.kernel(tangent_loss::Shape::default())?,
             place_backward: gpu.kernel(tangent_points_backward::Shape::default())?,
-            weight: config.loss.tangent as f32,
+            scale: config.loss.tangent as f32 / n as f32,
         }))
     }
 
@@ -77,7 +78,7 @@ impl Tangent {
             d_gradient: at_samples.d_gradient.ptr_mut(),
             d_gradient_beside: beside.d_gradient.ptr_mut(),
             n,
-            scale: self.weight / n as f32,
+            scale: self.scale,
         };
         rec.run(&self.compare, per_sample, args);
         let (d_sdf, d_points) = (self.d_sdf.ptr(), Some(self.d_points.ptr_mut()));

@@ -13,9 +13,7 @@ use glam::DMat4;
 use crate::config::{AppearanceAtEval, Config, MaskUse};
 use crate::gpu::{Gpu, Readback, Recorder, Ticket};
 use crate::model::{Background, Model, Proposal, Scratch, Surface, TapStep};
-use crate::render::{
-    Annealed, Loss, LossScales, Priors, Rendered, Renderer, Shot, TERMS, TRAINING, ViewTable,
-};
+use crate::render::{Annealed, Loss, Priors, Rendered, Renderer, Shot, TERMS, TRAINING, ViewTable};
 use crate::scene::{Camera, ObjectMasks, Region, Scene, Split};
 use crate::{Error, Result};
 use adam::Adam;
@@ -45,11 +43,28 @@ pub struct Trainer {
     tickets: std::collections::VecDeque<(u64, Ticket)>,
 }
 
-/// Losses of one step by the names of [`TERMS`], the total last.
+/// Losses of one step.
 #[derive(Clone, Debug)]
 pub struct StepLosses {
     pub step: u64,
+    /// By the names of [`TERMS`], the total last.
     pub values: [f32; TERMS.len() + 1],
+}
+
+impl StepLosses {
+    /// What the step made smaller.
+    pub fn total(&self) -> f32 {
+        self.values[TERMS.len()]
+    }
+
+    /// The term of this name in [`TERMS`].
+    ///
+    /// # Panics
+    /// If there is none.
+    pub fn of(&self, term: &str) -> f32 {
+        let found = TERMS.iter().position(|name| *name == term);
+        self.values[found.unwrap_or_else(|| panic!("no term is called '{term}'"))]
+    }
 }
 
 /// Steps whose losses stay readable.
@@ -120,19 +135,7 @@ impl Trainer {
             true,
         )?;
         let renderer = Renderer::new(gpu, config, &model, region, n_rays)?;
-        let loss = Loss::new(gpu, config, n_rays, priors)?;
-        let scales = LossScales {
-            eikonal: config.loss.eikonal as f32,
-            interlevel: config.loss.interlevel as f32,
-            tangent: config.loss.tangent as f32,
-        };
-        loss.set_terms(
-            gpu,
-            &renderer.surface.eikonal,
-            &renderer.sampler.interlevel_loss,
-            (config.loss.curvature.weight > 0.0).then_some(&renderer.surface.curvature),
-            scales,
-        )?;
+        let loss = Loss::new(gpu, config, &renderer, priors)?;
         let s = &config.sampling;
         let mut users = vec![
             (
@@ -218,7 +221,6 @@ impl Trainer {
         let (model, render, loss) = (&self.model, &self.renderer, &self.loss);
         let annealed = annealed(now);
         let look = render.look(annealed);
-        let n_samples = self.config.rays * self.config.sampling.samples;
 
         // Forward: put samples where the surface is likely, ask the fields, composite.
         model.refresh_weights(rec, annealed.released_levels);
@@ -249,7 +251,6 @@ impl Trainer {
             &self.scratch,
             &background_rays,
         );
-        let eikonal_scale = self.config.loss.eikonal as f32 / n_samples as f32;
         let shade_inputs = render.shade_inputs(annealed);
         model.surface.backward(
             rec,
@@ -257,16 +258,15 @@ impl Trainer {
             &render.surface,
             &self.scratch,
             &shade_inputs,
-            eikonal_scale,
+            loss.eikonal_scale,
         );
-        let interlevel_scale = self.config.loss.interlevel as f32 / self.config.rays as f32;
         render.sampler.backward(
             rec,
             model,
             &render.rays,
             &render.composite.weights,
             &self.scratch,
-            interlevel_scale,
+            loss.interlevel_scale,
         );
         model.fold_gradients(rec, annealed.released_levels);
         loss.sum(rec);

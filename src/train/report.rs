@@ -19,34 +19,12 @@ pub enum Control {
     Stop,
 }
 
-/// The parts of the loss, weighted as they are added up.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+/// A step's loss and its parts, weighted as they are added up.
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct Losses {
     pub total: f64,
-    pub color: f64,
-    pub eikonal: f64,
-    pub bias: f64,
-    /// Both proposal levels.
-    pub interlevel: f64,
-    /// Those that are switched on.
-    pub mask: Option<f64>,
-    pub sensor_depth: Option<f64>,
-    pub mono_depth: Option<f64>,
-    pub mono_normal: Option<f64>,
-}
-
-impl Losses {
-    /// Names and values of the optional ones that are switched on.
-    pub fn optional(&self) -> impl Iterator<Item = (&'static str, f64)> + use<> {
-        [
-            ("mask", self.mask),
-            ("sensor_depth", self.sensor_depth),
-            ("mono_depth", self.mono_depth),
-            ("mono_normal", self.mono_normal),
-        ]
-        .into_iter()
-        .filter_map(|(name, value)| Some((name, value?)))
-    }
+    /// By their names in [`crate::render::TERMS`], both proposal levels together as "interlevel"; without those that are switched off.
+    pub parts: Vec<(&'static str, f64)>,
 }
 
 /// Something that happened during a run.
@@ -114,7 +92,7 @@ impl Event {
         }
     }
 
-    /// As one log object: ts, level, event, step first, the rest as named in METHOD's losses and the fields above.
+    /// As one log object: ts, level, event, step first, the rest as the fields above, `loss.` before the names of losses.
     /// Numbers that are not finite become null.
     pub fn record(&self) -> Map<String, Value> {
         let (step, rest) = match self {
@@ -144,9 +122,7 @@ impl Event {
             } => (
                 step,
                 json!({
-                    "steps": steps, "loss.total": losses.total, "loss.color": losses.color, "loss.eikonal": losses.eikonal,
-                    "loss.bias": losses.bias, "loss.interlevel": losses.interlevel, "psnr": psnr,
-                    "crossing": crossing, "it_per_s": it_per_s,
+                    "steps": steps, "loss.total": losses.total, "psnr": psnr, "crossing": crossing, "it_per_s": it_per_s,
                 }),
             ),
             Event::Preview {
@@ -180,8 +156,8 @@ impl Event {
         };
         record.extend(rest);
         if let Event::Step { losses, .. } = self {
-            let named = losses.optional();
-            record.extend(named.map(|(name, value)| (format!("loss.{name}"), value.into())));
+            let parts = losses.parts.iter();
+            record.extend(parts.map(|(name, value)| (format!("loss.{name}"), (*value).into())));
         }
         record
     }
@@ -362,8 +338,7 @@ mod tests {
             steps: 100,
             losses: Losses {
                 total: f64::NAN,
-                mask: Some(0.25), // those that are not switched on are not named
-                ..Losses::default()
+                parts: vec![("color", f64::INFINITY), ("mask", 0.25)],
             },
             psnr: 20.5,
             crossing: 0.5,
@@ -380,17 +355,16 @@ mod tests {
                 "step",
                 "steps",
                 "loss.total",
-                "loss.color",
-                "loss.eikonal",
-                "loss.bias",
-                "loss.interlevel",
                 "psnr",
                 "crossing",
                 "it_per_s",
+                "loss.color",
                 "loss.mask"
             ]
         );
         assert_eq!(record["loss.total"], Value::Null);
+        assert_eq!(record["loss.color"], Value::Null);
+        assert_eq!(record["loss.mask"], 0.25);
         assert_eq!(record["psnr"], 20.5);
     }
 

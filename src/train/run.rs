@@ -83,7 +83,7 @@ impl Trainer {
                 if step.is_multiple_of(report.log_steps) {
                     pace.mark(step);
                     stopping |= tell(told(losses, &self.config, pace.per_second()));
-                    if surface.is_lost(share_that_crosses(losses)) {
+                    if surface.is_lost(losses.of("crossing")) {
                         let what = NO_SURFACE.into();
                         stopping |= tell(Event::Warning { step, what });
                     }
@@ -170,7 +170,10 @@ impl Trainer {
         let newest = checkpoint::latest(&run.checkpoints()).ok();
         match newest {
             Some(newest) if self.rate_factor == 1.0 => {
-                self.restore(&newest.checkpoint)?;
+                match newest.checkpoint.state().step == self.config.first_step {
+                    true => self.begin_from(&newest.checkpoint)?, // the end of the stage before this one
+                    false => self.restore(&newest.checkpoint)?,
+                }
                 self.rate_factor = SLOWED;
                 Ok(format!(
                     "{happened}: going on from the checkpoint of step {} with learning rates times {SLOWED}",
@@ -227,8 +230,16 @@ impl Trainer {
             ));
         }
         self.take(checkpoint, 1)?;
+        let params = &self.model.params;
+        self.gpu.submit("new moments", |rec| {
+            for moment in [params.first_moment(), params.second_moment()] {
+                rec.fill(moment, 0..moment.len(), 0);
+            }
+            Ok(())
+        })?;
         self.step = state.step;
-        Ok(())
+        self.tickets.clear();
+        self.gpu.finish()
     }
 
     /// Writes a checkpoint of everything that later steps depend on into `folder`; see [`checkpoint::save`].
@@ -426,40 +437,35 @@ fn side_by_side(rendered: &Rendered, photo: &RgbaImage) -> RgbImage {
 
 /// A finished step's losses as an event.
 fn told(losses: &StepLosses, config: &Config, it_per_s: f64) -> Event {
-    let of = |wanted: &str| -> f64 {
-        TERMS
-            .iter()
-            .zip(&losses.values)
-            .filter(|(name, _)| name.starts_with(wanted))
-            .map(|(_, value)| f64::from(*value))
-            .sum()
-    };
-    let optional = |weight: f64, name: &str| (weight > 0.0).then(|| of(name));
+    let of = |term| f64::from(losses.of(term));
     let weights = &config.loss;
+    let optional = [
+        ("tangent", weights.tangent),
+        ("curvature", weights.curvature.weight),
+        ("mask", weights.mask),
+        ("sensor_depth", weights.sensor_depth),
+        ("mono_depth", weights.mono_depth),
+        ("mono_normal", weights.mono_normal),
+    ];
+    let mut parts = vec![
+        ("color", of("color")),
+        ("eikonal", of("eikonal")),
+        ("interlevel", of("interlevel_0") + of("interlevel_1")),
+        ("bias", of("bias")),
+    ];
+    let switched_on = optional.iter().filter(|(_, weight)| *weight > 0.0);
+    parts.extend(switched_on.map(|&(term, _)| (term, of(term))));
     Event::Step {
         step: losses.step + 1,
         steps: config.total_steps(),
         losses: Losses {
-            total: f64::from(losses.values[TERMS.len()]),
-            color: of("color"),
-            eikonal: of("eikonal"),
-            bias: of("bias"),
-            interlevel: of("interlevel"),
-            mask: optional(weights.mask, "mask"),
-            sensor_depth: optional(weights.sensor_depth, "sensor_depth"),
-            mono_depth: optional(weights.mono_depth, "mono_depth"),
-            mono_normal: optional(weights.mono_normal, "mono_normal"),
+            total: f64::from(losses.total()),
+            parts,
         },
-        psnr: -10.0 * of("mse").log10(),
-        crossing: f64::from(share_that_crosses(losses)),
+        psnr: -10.0 * (of("square_error") / of("pixel_weight")).log10(),
+        crossing: of("crossing"),
         it_per_s,
     }
-}
-
-/// Share of a step's rays that meet an opaque surface.
-fn share_that_crosses(losses: &StepLosses) -> f32 {
-    let crossing = TERMS.iter().position(|term| *term == "crossing");
-    losses.values[crossing.expect("one of the terms")]
 }
 
 const NO_SURFACE: &str = "no ray meets a surface any more: pictures may still come out right, a mesh would be empty. Often the ground runs on \
@@ -495,7 +501,7 @@ impl BadSteps {
     fn watch(&mut self, losses: &StepLosses) -> bool {
         if self.last != Some(losses.step) {
             self.last = Some(losses.step);
-            self.count = match losses.values[TERMS.len()].is_finite() {
+            self.count = match losses.total().is_finite() {
                 true => 0,
                 false => self.count + 1,
             };

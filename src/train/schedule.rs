@@ -10,9 +10,7 @@
 //!                 it lie a quarter of level l's cell away, and the curvature weight is divided by the grid's growth l − 1 times
 //! A run of another length than `schedule_steps` is the same schedule, stretched: k = step · schedule_steps / steps, not rounded.
 
-use crate::config::{
-    Config, Drop, Exponential, HashConfig, MultiStep, Rise, ScaleBound, TapStepKind,
-};
+use crate::config::{Config, Drop, HashConfig, MultiStep, Rise, ScaleBound, TapStepKind};
 
 /// The schedules of a run.
 #[derive(Clone, Debug)]
@@ -101,7 +99,11 @@ impl Schedule {
         };
         let growth = growth(hash);
         let (tap_range, tap_floor) = match surface.tap_step {
-            TapStepKind::Random => (surface.tap_range, 0.25 / f64::from(hash.max)),
+            TapStepKind::Random => {
+                let x = k / *schedule_steps as f64;
+                let range = exponential(surface.tap_range, surface.tap_range_end, x);
+                (range, 0.25 / f64::from(hash.max))
+            }
             TapStepKind::Level => {
                 let cells = f64::from(hash.base) * growth.powi(level as i32 - 1);
                 (0.0, 0.25 * 2.0 / cells)
@@ -112,10 +114,17 @@ impl Schedule {
             lr_fields: multi_step(&optimizer.fields, k),
             lr_table: multi_step(&optimizer.table, k),
             lr_proposal: multi_step(&optimizer.proposal, k),
-            lr_background: exponential(&optimizer.background, k / *schedule_steps as f64),
+            lr_background: exponential(
+                optimizer.background.learning_rate,
+                optimizer.background.learning_rate_end,
+                k / *schedule_steps as f64,
+            ),
             anneal: anneal(k / sampling.anneal_steps as f64),
             inv_s_lower: scale_bound(&loss.scale_bound, k),
-            bias_weight: logarithmic(bias.weight_start, bias.weight, bias.ramp_steps, k),
+            bias_weight: match bias.weight > 0.0 {
+                true => logarithmic(bias.weight_start, bias.weight, bias.ramp_steps, k),
+                false => 0.0, // a ramp that ends with nothing is none
+            },
             curvature_weight: loss.curvature.weight * ramp(k, loss.curvature.warmup)
                 / growth.powi(level as i32 - 1),
             released_levels: level.max(hash.release.first).min(hash.levels),
@@ -184,9 +193,9 @@ fn multi_step(group: &MultiStep, k: f64) -> f64 {
     group.learning_rate * rise * group.gamma.powi(passed as i32)
 }
 
-fn exponential(group: &Exponential, x: f64) -> f64 {
-    let x = x.min(1.0);
-    ((1.0 - x) * group.learning_rate.ln() + x * group.learning_rate_end.ln()).exp()
+/// From `start` to `end` while x goes from 0 to 1, by equal factors in equal times.
+fn exponential(start: f64, end: f64, x: f64) -> f64 {
+    start * (end / start).powf(x.min(1.0))
 }
 
 #[cfg(test)]
@@ -215,6 +224,16 @@ mod tests {
             assert!((room.bias_weight / bias - 1.0).abs() < 2e-3, "{room:?}");
             assert!((now.anneal - anneal).abs() < 5e-4, "{now:?}");
             assert_eq!(now.bias_weight, 0.1, "constant outdoors");
+        }
+    }
+
+    #[test]
+    fn a_weight_of_nothing_has_no_ramp() {
+        let ramped = Config::preset("indoor-large").unwrap();
+        assert!(ramped.loss.bias.weight_start > 0.0 && ramped.loss.bias.ramp_steps > 0);
+        let off = ramped.with_assignment("loss.bias.weight=0").unwrap();
+        for step in [0, 1, 100, 20_000] {
+            assert_eq!(Schedule::new(&off).at(step).bias_weight, 0.0);
         }
     }
 

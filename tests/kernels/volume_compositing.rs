@@ -100,7 +100,6 @@ impl Batch {
                 scale_floor: scale.floor as f32,
                 inv_s_lower: scale.inv_s_lower as f32,
                 anneal: 1.0,
-                outside_empty: 1,
             },
         );
         depth
@@ -176,7 +175,6 @@ impl Batch {
                 scale_floor: scale.floor as f32,
                 inv_s_lower: scale.inv_s_lower as f32,
                 anneal: 1.0,
-                outside_empty: 1,
             },
         );
         d.each_ref().map(|buffer| device.take(buffer))

@@ -46,7 +46,6 @@ fn a_ray_along_the_surface_has_finite_derivatives() {
             scale_floor: (1.0 / INV_S) as f32,
             inv_s_lower: 1.0,
             anneal: 1.0,
-            outside_empty: 0,
         },
     );
     let tail = |f: f64| BIN * INV_S * INV_S * 0.5 * (-f.abs() / C * INV_S).exp();

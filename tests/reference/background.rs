@@ -42,7 +42,7 @@ pub struct Field {
     pub code: Option<Var>,
 }
 
-/// `samples + 1` edges, uniform in disparity: 1/t = s/far + (1 − s)/near, each s with its own draw.
+/// `samples + 1` edges, uniform in disparity: 1/t = s/far + (1 − s)/near, each s with its own draw; `far` at least twice as far as `near`.
 pub fn edges(samples: usize, near: f64, far: f64, draws: Option<&[f64]>) -> Vec<f64> {
     let draw = |edge: usize| draws.map_or(0.5, |draws| draws[edge]);
     let s = place(
@@ -50,7 +50,7 @@ pub fn edges(samples: usize, near: f64, far: f64, draws: Option<&[f64]>) -> Vec<
         draws.is_some().then_some(&draw as &dyn Fn(usize) -> f64),
     );
     s.into_iter()
-        .map(|s| 1.0 / (s / far + (1.0 - s) / near))
+        .map(|s| 1.0 / (s / far.max(2.0 * near) + (1.0 - s) / near))
         .collect()
 }
 

@@ -510,11 +510,8 @@ impl Step {
             .collect()
     }
 
-    /// f := +1000 on rays that miss the region, where a background takes their place: no density, and no gradient through it.
+    /// f := +1000 on rays that miss the region: no density, and no gradient through it.
     fn empty_outside(&self, tape: &mut Tape, sdf: Var, stretches: &[Stretch]) -> Var {
-        if self.config.background == Background::Black {
-            return sdf;
-        }
         let samples = self.config.samples;
         let outside: Vec<bool> = (0..sdf.len())
             .map(|i| stretches[i / samples].outside)

@@ -6,7 +6,6 @@ use glam::{DVec2, DVec3};
 use neurodin::Result;
 use neurodin::config::{BackgroundKind, Config};
 use neurodin::gpu::GpuOptions;
-use neurodin::render::TERMS;
 use neurodin::scene::synthetic::RADIUS;
 use neurodin::scene::{PriorPaths, RegionShape, Split, View};
 
@@ -98,10 +97,7 @@ fn a_models_own_depths_and_normals_cost_it_little() -> Result<()> {
         rig.trainer.step()?;
         let losses = rig.trainer.finish()?.expect("the losses of a step");
         rig.check_device()?;
-        Ok(["sensor_depth", "mono_depth", "mono_normal"].map(|name| {
-            let term = TERMS.iter().position(|term| *term == name);
-            f64::from(losses.values[term.expect("a term")])
-        }))
+        Ok(["sensor_depth", "mono_depth", "mono_normal"].map(|term| f64::from(losses.of(term))))
     };
     let agreeing = losses(&Own::clone)?;
     let mirrored = losses(&|(depths, normals): &Own| {

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use glam::{DVec3, dvec3};
-use serde_json::{Value, json};
+use serde_json::{Map, Value, json};
 
 use super::chart::{Chart, Series, grouped, short};
 use super::mesh_picture::{Eye, Lens, Rgb, Visible, clay, colors, sun_eye};
@@ -288,6 +288,16 @@ fn charts(log: &str) -> Vec<Chart> {
         .lines()
         .filter_map(|line| serde_json::from_str(line).ok())
         .collect();
+    let mut losses: Vec<&String> = Vec::new();
+    for key in records
+        .iter()
+        .filter_map(Value::as_object)
+        .flat_map(Map::keys)
+    {
+        if key.starts_with("loss.") && !losses.contains(&key) {
+            losses.push(key);
+        }
+    }
     let series = |name: &str, event: &str, key: &str| Series {
         name: name.into(),
         points: records
@@ -308,13 +318,13 @@ fn charts(log: &str) -> Vec<Chart> {
             "Losses, weighted",
             "loss",
             true,
-            vec![
-                series("total", "step", "loss.total"),
-                series("colour", "step", "loss.color"),
-                series("eikonal", "step", "loss.eikonal"),
-                series("bias correction", "step", "loss.bias"),
-                series("proposals", "step", "loss.interlevel"),
-            ],
+            losses
+                .iter()
+                .map(|key| {
+                    let name = key.trim_start_matches("loss.").replace('_', " ");
+                    series(&name, "step", key)
+                })
+                .collect(),
         ),
         chart(
             "Peak signal-to-noise ratio",
