@@ -185,6 +185,7 @@ fn camera_normals(stored: &[f64]) -> std::result::Result<Vec<f32>, String> {
 #[derive(Debug, Default)]
 pub struct ObjectMasks {
     hides: bool,
+    shows: bool,
 }
 
 impl ObjectMasks {
@@ -206,8 +207,32 @@ impl ObjectMasks {
                 "mark the object in white, take the view out of the dataset, or train with scene.masks=\"exclude\" or \"ignore\"",
             ));
         }
-        self.hides |= object < pixels;
+        self.note(object, pixels);
         Ok(())
+    }
+
+    /// Looks at one view's, which may leave nothing of it.
+    pub fn look_at_any(&mut self, picture: &Picture) {
+        let shown = picture.rgba.chunks_exact(4).filter(|p| p[3] >= 128).count();
+        self.note(shown, picture.rgba.len() / 4);
+    }
+
+    fn note(&mut self, shown: usize, pixels: usize) {
+        self.hides |= shown < pixels;
+        self.shows |= shown > 0;
+    }
+
+    /// # Errors
+    /// [`Error::Input`] if none of those that were looked at leaves a pixel to train on.
+    pub fn check_anything_is_left(&self, scene: &Scene) -> Result<()> {
+        if self.shows {
+            return Ok(());
+        }
+        Err(Error::input(
+            &scene.root,
+            "the masks of all training views leave no pixel to train on",
+            "masks are white where a picture counts: invert them, or train with scene.masks=\"ignore\"",
+        ))
     }
 
     /// # Errors

@@ -115,12 +115,17 @@ impl Trainer {
         let mut masks = ObjectMasks::default();
         let pictures = training.iter().map(|&v| {
             let (view, picture) = (&scene.views[v], scene.load_picture(v)?);
-            if config.scene.masks == MaskUse::Foreground {
-                masks.look(view, &picture)?;
+            match config.scene.masks {
+                MaskUse::Ignore => {}
+                MaskUse::Exclude => masks.look_at_any(&picture),
+                MaskUse::Foreground => masks.look(view, &picture)?,
             }
             Ok((view.camera.clone(), view.world_from_camera, picture))
         });
         let views = ViewTable::new(gpu, region, pictures, others.iter())?;
+        if config.scene.masks == MaskUse::Exclude {
+            masks.check_anything_is_left(scene)?;
+        }
         if config.loss.mask > 0.0 {
             masks.check(scene)?;
         }

@@ -142,3 +142,26 @@ fn object_masks_have_to_hold_something() {
     half.save(&file).unwrap();
     look(&dataset.open().unwrap()).unwrap();
 }
+
+#[test]
+fn masks_have_to_leave_something_to_train_on() {
+    let rig = Rig::skewed(2);
+    let dataset = rig.dataset(&rig.transforms(json!({})));
+    fs::create_dir_all(dataset.at("masks")).unwrap();
+    let look = |scene: &Scene| {
+        let mut masks = ObjectMasks::default();
+        for index in 0..scene.views.len() {
+            masks.look_at_any(&scene.load_picture(index).unwrap());
+        }
+        masks.check_anything_is_left(scene)
+    };
+    look(&dataset.open().unwrap()).unwrap();
+    for name in ["masks/view_000.png", "masks/view_001.png"] {
+        look(&dataset.open().unwrap()).unwrap();
+        GrayImage::new(64, 48).save(dataset.at(name)).unwrap();
+    }
+    refused(
+        look(&dataset.open().unwrap()),
+        &["no pixel to train on", "invert them"],
+    );
+}
