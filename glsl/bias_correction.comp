@@ -1,6 +1,7 @@
 #version 460
 #define LOCAL_SIZE 256
 #include "lib/prelude.glsl"
+#include "lib/workgroup_sum.glsl"
 // Explicit bias correction (Wang et al. 2024, NeuRodin): just behind the heaviest sample the signed distance should be negative.
 //     hinge_r = max(sdf(P + eps d) + eps, 0) [sdf(P + offset d) > 0]
 //     loss_r = gate_r hinge_r              as the paper means it
@@ -17,19 +18,11 @@ layout(push_constant, scalar) uniform Args {
     uint published;
 };
 
-shared float partial[LOCAL_SIZE];
-
 void main() {
     uint lane = gl_LocalInvocationID.x;
     float sum = 0.0;
     for (uint ray = lane; ray < n; ray += LOCAL_SIZE) sum += gate.at[ray];
-    partial[lane] = sum;
-    barrier();
-    for (uint stride = LOCAL_SIZE / 2u; stride > 0u; stride /= 2u) {
-        if (lane < stride) partial[lane] += partial[lane + stride];
-        barrier();
-    }
-    float mean_gate = partial[0] / float(n);
+    float mean_gate = workgroup_sum(sum) / float(n);
 
     for (uint ray = lane; ray < n; ray += LOCAL_SIZE) {
         float factor = published != 0u ? mean_gate : gate.at[ray];

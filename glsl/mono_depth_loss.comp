@@ -2,6 +2,7 @@
 #define LOCAL_SIZE 256
 #include "lib/prelude.glsl"
 #include "lib/supervision.glsl"
+#include "lib/workgroup_sum.glsl"
 // Squared error of the rendered z-depth against a monocular one that is known up to scale and shift, and its gradient; ONE workgroup, since
 // a batch (of one view) has one scale and one shift (Yu et al. 2022, MonoSDF):
 //     x = c t,  loss = (a x + b - p)^2 with a, b those of least squares over the batch:  a = cov(x, p)/var(x),  b = mean(p) - a mean(x)
@@ -18,21 +19,7 @@ layout(push_constant, scalar) uniform Args {
     float scale; // the loss's weight / number of rays
 };
 
-shared vec3 partial[LOCAL_SIZE];
-
-// The sum of every invocation's share, in a fixed order.
-vec3 total(vec3 share) {
-    uint lane = gl_LocalInvocationID.x;
-    partial[lane] = share;
-    barrier();
-    for (uint stride = LOCAL_SIZE / 2u; stride > 0u; stride /= 2u) {
-        if (lane < stride) partial[lane] += partial[lane + stride];
-        barrier();
-    }
-    vec3 sum = partial[0];
-    barrier(); // before the next sum reuses partial
-    return sum;
-}
+vec3 total(vec3 share) { return vec3(workgroup_sum(share.x), workgroup_sum(share.y), workgroup_sum(share.z)); }
 
 // Rendered z-depth, prior and weight of a ray; the prior is 0 where the weight is.
 vec3 pair(uint ray) {

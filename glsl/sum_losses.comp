@@ -1,6 +1,7 @@
 #version 460
 #define LOCAL_SIZE 256
 #include "lib/prelude.glsl"
+#include "lib/workgroup_sum.glsl"
 // Sums of loss arrays: losses[k] = scale_k * sum of term k's values, losses[n_terms] = the total
 // of those that count. ONE workgroup, fixed order: the same
 // values give the same sums in every run. non_finite is set where a sum is not a number or infinite, and never cleared here.
@@ -20,8 +21,6 @@ layout(push_constant, scalar) uniform Args {
     uint n_terms;
 };
 
-shared float partial[LOCAL_SIZE];
-
 void main() {
     uint lane = gl_LocalInvocationID.x;
     float total = 0.0;
@@ -29,16 +28,9 @@ void main() {
         LossTerm term = terms.at[k];
         float sum = 0.0;
         for (uint i = lane; i < term.count; i += LOCAL_SIZE) sum += term.values.at[i];
-        partial[lane] = sum;
-        barrier();
-        for (uint stride = LOCAL_SIZE / 2u; stride > 0u; stride /= 2u) {
-            if (lane < stride) partial[lane] += partial[lane + stride];
-            barrier();
-        }
-        float loss = term.scale * partial[0];
+        float loss = term.scale * workgroup_sum(sum);
         if (term.counts != 0u) total += loss;
         if (lane == 0u) losses.at[k] = loss;
-        barrier(); // before the next term reuses partial
     }
     if (lane == 0u) {
         losses.at[n_terms] = total;
