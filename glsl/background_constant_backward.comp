@@ -1,6 +1,7 @@
 #version 460
 // Gradient of the learned background colour: the sum over all rays through the sigmoid, added up by one workgroup in a fixed order.
 #include "lib/prelude.glsl"
+#include "lib/scalar.glsl"
 #include "lib/sums.glsl"
 #include "lib/workgroup_sum.glsl"
 
@@ -17,7 +18,7 @@ void main() {
         float sum = 0.0;
         for (uint ray = lane; ray < n_rays; ray += LOCAL_SIZE) sum += d_color.at[c * n_rays + ray];
         sum = workgroup_sum(sum);
-        float y = 1.0 / (1.0 + exp(-logits.at[c]));
+        float y = sigmoid(logits.at[c]);
         if (lane == 0u) add_alone(d_logits, c, sum * y * (1.0 - y));
     }
 }

@@ -1,6 +1,7 @@
 #version 460
 #define LOCAL_SIZE 256
 #include "lib/prelude.glsl"
+#include "lib/scalar.glsl"
 #include "lib/supervision.glsl"
 #include "lib/workgroup_sum.glsl"
 // Squared error of the rendered z-depth against a monocular one that is known up to scale and shift, and its gradient; ONE workgroup, since

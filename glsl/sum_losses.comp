@@ -1,6 +1,7 @@
 #version 460
 #define LOCAL_SIZE 256
 #include "lib/prelude.glsl"
+#include "lib/scalar.glsl"
 #include "lib/workgroup_sum.glsl"
 // Sums of loss arrays: losses[k] = scale_k * sum of term k's values, losses[n_terms] = the total
 // of those that count. ONE workgroup, fixed order: the same
@@ -34,6 +35,6 @@ void main() {
     }
     if (lane == 0u) {
         losses.at[n_terms] = total;
-        if ((floatBitsToUint(total) & 0x7F800000u) == 0x7F800000u) non_finite.at[0] = 1u;
+        if (!is_finite(total)) non_finite.at[0] = 1u;
     }
 }

@@ -19,5 +19,3 @@ const uint IMAGE_DEPTH = 5u;
 float ray_weight(F32s target, U32s ray_outside, uint ray, uint n) {
     return ray_outside.at[ray] == 0u ? target.at[3u * n + ray] : 0.0;
 }
-
-bool is_finite(float x) { return (floatBitsToUint(x) & 0x7F800000u) != 0x7F800000u; }
