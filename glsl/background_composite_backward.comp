@@ -20,7 +20,7 @@ void main() {
     uint ray = item();
     if (ray >= n_rays) return;
     uint n = n_rays * n_samples;
-    vec3 d_c = vec3(d_color.at[ray], d_color.at[n_rays + ray], d_color.at[2u * n_rays + ray]);
+    vec3 d_c = vector_at(d_color, ray, n_rays);
 
     // Forward: the transmittance after each sample, left in d_raw until the way back overwrites it.
     float depth = 0.0;
@@ -40,11 +40,8 @@ void main() {
         float tau = exp(min(out_, 15.0)) * (edges.at[e + 1u] - edges.at[e]);
         float w = 1.0 - exp(-tau);
         if (s > 0u) w *= d_raw.at[p - 1u];
-        float worth = 0.0;
-        [[unroll]] for (uint c = 0u; c < 3u; ++c) {
-            worth += d_c[c] * rgb.at[c * n + p];
-            d_rgb.at[c * n + p] = w * d_c[c];
-        }
+        float worth = dot(d_c, vector_at(rgb, p, n));
+        set_vector(d_rgb, p, n, w * d_c);
         advantage = worth - next_worth + passed * advantage;
         d_raw.at[p] = out_ > 15.0 ? 0.0 : tau * d_raw.at[p] * advantage;
         next_worth = worth;

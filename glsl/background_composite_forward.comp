@@ -22,8 +22,8 @@ void main() {
         uint e = ray * (n_samples + 1u) + s;
         float tau = exp(min(raw.at[p], 15.0)) * (edges.at[e + 1u] - edges.at[e]);
         float w = exp(-depth) - exp(-depth - tau);
-        sum += w * vec3(rgb.at[p], rgb.at[n + p], rgb.at[2u * n + p]);
+        sum += w * vector_at(rgb, p, n);
         depth += tau;
     }
-    [[unroll]] for (uint c = 0u; c < 3u; ++c) color.at[c * n_rays + ray] = sum[c];
+    set_vector(color, ray, n_rays, sum);
 }

@@ -45,10 +45,9 @@ void main() {
         d_optical_depth.at[row + i] = transmittance;
     }
 
-    vec3 d_pixel = vec3(d_color.at[ray], d_color.at[n + ray], d_color.at[2u * n + ray]);
-    vec3 behind = vec3(background.at[ray], background.at[n + ray], background.at[2u * n + ray]);
-    [[unroll]] for (uint channel = 0u; channel < 3u; channel++)
-        d_background.at[channel * n + ray] = transmittance * d_pixel[channel];
+    vec3 d_pixel = vector_at(d_color, ray, n);
+    vec3 behind = vector_at(background, ray, n);
+    set_vector(d_background, ray, n, transmittance * d_pixel);
 
     float d_accumulation = 0.0, d_depth = 0.0, depth = 0.0, s1 = 0.0;
     vec3 d_normal = vec3(0.0);
@@ -59,7 +58,7 @@ void main() {
         depth = image.at[IMAGE_DEPTH * n + ray];
         d_accumulation = d_image.at[D_ACCUMULATION * n + ray];
         d_depth = d_image.at[D_DEPTH * n + ray] / (image.at[IMAGE_ACCUMULATION * n + ray] + 1e-10);
-        [[unroll]] for (uint axis = 0u; axis < 3u; axis++) d_normal[axis] = d_image.at[(D_NORMAL + axis) * n + ray];
+        d_normal = vector_at(d_image, D_NORMAL * n + ray, n);
     }
 
     // Backward.
@@ -72,11 +71,8 @@ void main() {
         float weight = opacity(tau);
         if (i > 0u) weight *= d_optical_depth.at[p - 1u];
 
-        float worth = 0.0;
-        [[unroll]] for (uint channel = 0u; channel < 3u; channel++) {
-            worth += d_pixel[channel] * padded_rgb(rgb.at[channel * count + p]);
-            d_rgb.at[channel * count + p] = (1.0 + 2.0 * RGB_PADDING) * weight * d_pixel[channel];
-        }
+        float worth = dot(d_pixel, padded_rgb(vector_at(rgb, p, count)));
+        set_vector(d_rgb, p, count, (1.0 + 2.0 * RGB_PADDING) * weight * d_pixel);
         if (SUPERVISED != 0u) {
             float s0 = edges.at[p + ray];
             worth += d_depth * (bin_midpoint(span, s0, s1) - depth);

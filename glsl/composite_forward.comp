@@ -34,7 +34,7 @@ void main() {
         float tau = optical_depth.at[p];
         float weight = opacity(tau) * transmittance;
         weights.at[p] = weight;
-        color += weight * vec3(padded_rgb(rgb.at[p]), padded_rgb(rgb.at[count + p]), padded_rgb(rgb.at[2u * count + p]));
+        color += weight * padded_rgb(vector_at(rgb, p, count));
         weighted_distance += weight * bin_midpoint(span, s0, s1);
         tau_sum += tau;
         transmittance = exp(-tau_sum);
@@ -42,8 +42,7 @@ void main() {
     }
 
     float accumulation = opacity(tau_sum);
-    [[unroll]] for (uint channel = 0u; channel < 3u; channel++)
-        image.at[channel * n + ray] = color[channel] + transmittance * background.at[channel * n + ray];
+    set_vector(image, ray, n, color + transmittance * vector_at(background, ray, n));
     image.at[3u * n + ray] = accumulation;
     image.at[4u * n + ray] = transmittance;
     image.at[5u * n + ray] = weighted_distance / (accumulation + 1e-10);

@@ -46,15 +46,13 @@ void main() {
     ViewPriors map = maps.at[ray_view.at[ray]];
     uvec2 pixel = drawn_pixel(view, pixel_draws, ray, n);
     float m[12] = view.region_from_camera;
-    priors.at[PRIOR_COSINE * n + ray] =
-        -(m[2] * directions.at[ray] + m[6] * directions.at[n + ray] + m[10] * directions.at[2u * n + ray]);
+    priors.at[PRIOR_COSINE * n + ray] = -dot(vec3(m[2], m[6], m[10]), vector_at(directions, ray, n));
     if (MONO_DEPTH != 0u)
         priors.at[PRIOR_MONO_DEPTH * n + ray] = map.mono_depth.at[nearest(pixel, view, map.mono_depth_width, map.mono_depth_height)];
     if (MONO_NORMAL != 0u) {
         uint at = nearest(pixel, view, map.mono_normal_width, map.mono_normal_height);
         uint size = map.mono_normal_width * map.mono_normal_height;
-        [[unroll]] for (uint axis = 0u; axis < 3u; axis++)
-            priors.at[(PRIOR_MONO_NORMAL + axis) * n + ray] = map.mono_normal.at[axis * size + at];
+        set_vector(priors, PRIOR_MONO_NORMAL * n + ray, n, vector_at(map.mono_normal, at, size));
     }
     if (SENSOR_DEPTH != 0u)
         priors.at[PRIOR_SENSOR_DEPTH * n + ray] = map.sensor_depth.at[nearest(pixel, view, map.sensor_depth_width, map.sensor_depth_height)];

@@ -35,10 +35,8 @@ void main() {
     uvec2 pixel = drawn_pixel(view, pixel_draws, index, n);
     Ray ray = pixel_ray(view, pixel, region_shape, half_extents);
     vec4 wanted = pixel_target(view, pixel, use_mask);
-    [[unroll]] for (uint axis = 0u; axis < 3u; axis++) {
-        origins.at[axis * n + index] = ray.origin[axis];
-        directions.at[axis * n + index] = ray.direction[axis];
-    }
+    set_vector(origins, index, n, ray.origin);
+    set_vector(directions, index, n, ray.direction);
     near_far.at[index] = ray.near;
     near_far.at[n + index] = ray.far;
     ray_view.at[index] = below;

@@ -36,13 +36,11 @@ void main() {
     uint point = begin + item();
     if (STRAIGHT != 0u) point = min(point, end - 1u);
     else if (point >= end) return;
-    vec3 x = vec3(points.at[point], points.at[n + point], points.at[2u * n + point]);
+    vec3 x = vector_at(points, point, n);
     if (PART != 2u) {
         uint first_level = PART == 1u ? level_of_slice(LEVELS) : 0u;
         uint end_level = PART == 1u ? first_level + 1u : LEVELS;
-        if (COORDINATES != 0u && first_level == 0u) {
-            [[unroll]] for (uint c = 0u; c < 3u; ++c) inputs.at[c * n + point] = x[c];
-        }
+        if (COORDINATES != 0u && first_level == 0u) set_vector(inputs, point, n, x);
         for (uint l = first_level; l < end_level; ++l) {
             Level level = levels.at[l];
             Cell cell = cell_of(level, x);

@@ -52,12 +52,10 @@ void main() {
             heaviest.at[ray] = k;
             uint edge = row + ray + k;
             float t = bin_midpoint(ray_span(near_far, n, ray), edges.at[edge], edges.at[edge + 1u]);
-            [[unroll]] for (uint axis = 0u; axis < 3u; axis++) {
-                float d = directions.at[axis * n + ray];
-                float middle = origins.at[axis * n + ray] + t * d;
-                queries.at[axis * 2u * n + ray] = middle + eps * d;
-                queries.at[axis * 2u * n + n + ray] = middle + offset * d;
-            }
+            vec3 d = vector_at(directions, ray, n);
+            vec3 middle = vector_at(origins, ray, n) + t * d;
+            set_vector(queries, ray, 2u * n, middle + eps * d);
+            set_vector(queries, n + ray, 2u * n, middle + offset * d);
         }
     }
 }

@@ -20,6 +20,5 @@ void main() {
     uint ray = index / n_samples;
     uint edge = index + ray; // edges have one more per ray than bins
     float t = bin_midpoint(ray_span(near_far, n, ray), edges.at[edge], edges.at[edge + 1u]);
-    [[unroll]] for (uint axis = 0u; axis < 3u; axis++)
-        points.at[axis * count + index] = origins.at[axis * n + ray] + t * directions.at[axis * n + ray];
+    set_vector(points, index, count, vector_at(origins, ray, n) + t * vector_at(directions, ray, n));
 }

@@ -21,8 +21,7 @@ layout(push_constant, scalar) uniform Args {
 void main() {
     uint ray = item();
     if (ray >= n) return;
-    vec3 p;
-    [[unroll]] for (uint axis = 0u; axis < 3u; axis++) p[axis] = priors.at[(PRIOR_MONO_NORMAL + axis) * n + ray];
+    vec3 p = vector_at(priors, PRIOR_MONO_NORMAL * n + ray, n);
     float weight = p != vec3(0.0) ? ray_weight(target, ray_outside, ray, n) : 0.0;
     float m[12] = views.at[ray_view.at[ray]].region_from_camera;
     mat3 camera_from_region = mat3(m[0], m[1], m[2], m[4], m[5], m[6], m[8], m[9], m[10]); // by columns
@@ -31,5 +30,5 @@ void main() {
     loss.at[ray] = weight * (abs(error.x) + abs(error.y) + abs(error.z) + 1.0 - dot(normal_of(rendered), p));
     vec3 d_rendered = scale * weight * normal_backward(rendered, sign(error) - p);
     vec3 d_normal = transpose(camera_from_region) * d_rendered;
-    [[unroll]] for (uint axis = 0u; axis < 3u; axis++) d_image.at[(D_NORMAL + axis) * n + ray] += d_normal[axis];
+    set_vector(d_image, D_NORMAL * n + ray, n, vector_at(reading(d_image), D_NORMAL * n + ray, n) + d_normal);
 }

@@ -21,5 +21,5 @@ void main() {
         vec3 g = vec3(shading.at[ROW_GRADIENT * n + p], shading.at[(ROW_GRADIENT + 1u) * n + p], shading.at[(ROW_GRADIENT + 2u) * n + p]);
         sum += weights.at[p] / max(length(g), 1e-12) * g;
     }
-    [[unroll]] for (uint c = 0u; c < 3u; ++c) normals.at[c * n_rays + ray] = sum[c];
+    set_vector(normals, ray, n_rays, sum);
 }

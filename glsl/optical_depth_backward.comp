@@ -42,8 +42,5 @@ void main() {
     float d_tau = d_sdf.at[p];
     d_sdf.at[p] = d_tau * depth.d_sdf;
     d_scale.at[p] = d_tau * depth.d_inv_s * at.d_parameter;
-    if (GRADIENT != 0u) {
-        [[unroll]] for (uint axis = 0u; axis < 3u; ++axis)
-            d_gradient.at[axis * n + p] = d_tau * depth.d_cosine * directions.at[axis * n_rays + ray];
-    }
+    if (GRADIENT != 0u) set_vector(d_gradient, p, n, d_tau * depth.d_cosine * vector_at(directions, ray, n_rays));
 }

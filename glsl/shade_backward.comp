@@ -26,16 +26,13 @@ layout(push_constant, scalar) uniform Args {
 void main() {
     uint p = item();
     if (p >= n) return;
-    vec3 g, d_g;
-    [[unroll]] for (uint c = 0u; c < 3u; ++c) {
-        g[c] = shading.at[(ROW_GRADIENT + c) * n + p];
-        d_g[c] = d_shading.at[(ROW_GRADIENT + c) * n + p];
-        if (HEARD != 0u) d_g[c] += d_gradient.at[c * n + p];
-    }
+    vec3 g = vector_at(shading, ROW_GRADIENT * n + p, n);
+    vec3 d_g = vector_at(d_shading, ROW_GRADIENT * n + p, n);
+    if (HEARD != 0u) d_g += vector_at(reading(d_gradient), p, n);
     float norm = length(g);
     if (norm > 0.0) d_g += 2.0 * eikonal_scale * (norm - 1.0) / norm * g;
     if (TAPS == 0u) {
-        [[unroll]] for (uint c = 0u; c < 3u; ++c) d_gradient.at[c * n + p] = d_g[c];
+        set_vector(d_gradient, p, n, d_g);
         return;
     }
     float delta = tap_step(tap_draws.at[p], tap_range, tap_floor);
@@ -43,9 +40,9 @@ void main() {
     if (CURVATURE != 0u) {
         float trace = 0.0;
         for (uint tap = 0u; tap < TAPS; ++tap) trace += sdf.at[(1u + tap) * n + p] - sdf.at[p];
-        d_trace = curvature_scale * sign(trace) * 6.0 / (float(TAPS) * delta * delta);
+        d_trace = curvature_scale * trace_factor(delta) * sign(trace);
         d_sdf.at[p] -= float(TAPS) * d_trace;
     }
-    d_g *= 3.0 / (float(TAPS) * delta);
+    d_g *= gradient_factor(delta);
     for (uint tap = 0u; tap < TAPS; ++tap) d_sdf.at[(1u + tap) * n + p] = dot(tap_direction(tap), d_g) + d_trace;
 }

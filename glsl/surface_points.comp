@@ -30,10 +30,7 @@ void main() {
     float s = edges.at[index + ray]; // edges have one more per ray than bins
     float t = MIDPOINT != 0u ? bin_midpoint(span, s, edges.at[index + ray + 1u]) : distance_at(span, s);
     float delta = TAPS > 0u ? tap_step(tap_draws.at[index], tap_range, tap_floor) : 0.0;
-    [[unroll]] for (uint axis = 0u; axis < 3u; axis++) {
-        float x = origins.at[axis * n + ray] + t * directions.at[axis * n + ray];
-        uint first = axis * total + index;
-        points.at[first] = x;
-        for (uint tap = 0u; tap < TAPS; tap++) points.at[first + (1u + tap) * count] = x + delta * tap_direction(tap)[axis];
-    }
+    vec3 x = vector_at(origins, ray, n) + t * vector_at(directions, ray, n);
+    set_vector(points, index, total, x);
+    for (uint tap = 0u; tap < TAPS; tap++) set_vector(points, (1u + tap) * count + index, total, x + delta * tap_direction(tap));
 }

@@ -31,7 +31,7 @@ void main() {
     uint l = level_of_slice(LEVELS);
     if (point >= n || uses.at[l].whole != 0u) return;
     Level level = levels.at[l];
-    Cell cell = cell_of(level, vec3(points.at[point], points.at[n + point], points.at[2u * n + point]));
+    Cell cell = cell_of(level, vector_at(points, point, n));
     uint now = clock.at[0];
     Rates rates = Rates(0.0, 0.0, 1.0, share1, share2, epsilon);
     uint touched = 0u;

@@ -28,10 +28,8 @@ void main() {
     uint number = min(first + index, camera.width * camera.height - 1u);
     uvec2 pixel = uvec2(number % camera.width, number / camera.width);
     Ray ray = pixel_ray(camera, pixel, region_shape, half_extents);
-    [[unroll]] for (uint axis = 0u; axis < 3u; axis++) {
-        origins.at[axis * n + index] = ray.origin[axis];
-        directions.at[axis * n + index] = ray.direction[axis];
-    }
+    set_vector(origins, index, n, ray.origin);
+    set_vector(directions, index, n, ray.direction);
     near_far.at[index] = ray.near;
     near_far.at[n + index] = ray.far;
     ray_view.at[index] = appearance_view;

@@ -1,7 +1,5 @@
 // Normals of the signed distance, n = g/‖g‖, and what g hears from them.
 
-vec3 vector_at(F32s planes, uint p, uint n) { return vec3(planes.at[p], planes.at[n + p], planes.at[2u * n + p]); }
-
 vec3 normal_of(vec3 g) { return g / max(length(g), 1e-12); }
 
 // What g hears from its normal: (d_n - n (n·d_n)) / ‖g‖.

@@ -91,11 +91,9 @@ BinDepth bin_depth(float f, float c, float inv_s, float bin, float anneal) {
     return laplace_depth(f, inv_s, bin);
 }
 
-// c = g·d of sample p, kept from zero as published: by what is added last, since a sum that begins with it loses it, and 0 comes out of
+// c = g·d of sample p, kept from zero as published: by what is added last, since a sum that began with it would lose it, and 0 comes out of
 // one sample in some ten million. A derivative by 0 would make every parameter NaN, although the loss is finite.
 float cosine(F32s gradient, F32s directions, uint p, uint n, uint ray, uint n_rays) {
-    float sum = 0.0;
-    [[unroll]] for (uint axis = 0u; axis < 3u; ++axis) sum += gradient.at[axis * n + p] * directions.at[axis * n_rays + ray];
-    float c = sum + 1e-8;
+    float c = dot(vector_at(gradient, p, n), vector_at(directions, ray, n_rays)) + 1e-8;
     return c == 0.0 ? 1e-8 : c;
 }

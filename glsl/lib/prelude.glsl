@@ -45,6 +45,15 @@ F32s from(F32s p, uint i) {
 F32s from(F32s p, uint i) { return F32s(uint64_t(p) + 4ul * i); }
 #endif
 
+// A vector of [3, n] numbers: its components lie in planes of n.
+vec3 vector_at(F32s planes, uint p, uint n) { return vec3(planes.at[p], planes.at[n + p], planes.at[2u * n + p]); }
+
+void set_vector(F32sMut planes, uint p, uint n, vec3 v) {
+    planes.at[p] = v.x;
+    planes.at[n + p] = v.y;
+    planes.at[2u * n + p] = v.z;
+}
+
 // Two neighbours from an even index on, in one access: software devices make one of each component of a vector.
 #ifdef CORE_ONLY
 vec2 pair_at(F32s p, uint i) { return vec2(p.at[i], p.at[i + 1u]); }

@@ -20,6 +20,6 @@ float proposal_density_slope(float raw) {
 // The network's colour in (0,1) is stretched a little so that black and white can be reached (Barron et al. 2021, Mip-NeRF).
 const float RGB_PADDING = 0.001;
 
-float padded_rgb(float rgb) {
+vec3 padded_rgb(vec3 rgb) {
     return (1.0 + 2.0 * RGB_PADDING) * rgb - RGB_PADDING;
 }
