@@ -43,10 +43,6 @@ impl Composite {
     /// Buffers and kernels for a batch of rays.
     pub fn new(gpu: &Gpu, config: &Config, n_rays: u32) -> Result<Composite> {
         let (n, samples) = (u64::from(n_rays), u64::from(config.sampling.samples));
-        let shading = normal_map::Shape {
-            geometry: config.surface.features,
-            appearance: config.appearance.dims,
-        };
         let density = density_of(config.surface.density);
         let scale = scale_of(config.surface.scale);
         Ok(Composite {
@@ -57,7 +53,7 @@ impl Composite {
             backward: gpu.kernel(composite_backward::Shape {
                 supervised: u32::from(config.loss.is_supervised()),
             })?,
-            normal_map: gpu.kernel(shading)?,
+            normal_map: gpu.kernel(normal_map::Shape::default())?,
             normal_map_backward: match config.loss.mono_normal > 0.0 {
                 true => Some(gpu.kernel(normal_map_backward::Shape::default())?),
                 false => None,
@@ -179,10 +175,10 @@ impl Composite {
     }
 
     /// Rendered normals, into `self.normals`.
-    pub fn normal_map(&self, rec: &mut Recorder, look: &Look) {
+    pub fn normal_map(&self, rec: &mut Recorder, look: &Look, model: &Model) {
         let args = normal_map::Args {
             weights: self.weights.ptr(),
-            shading: look.surface.shading.ptr(),
+            gradient: model.surface.gradient(look.surface),
             normals: self.normals.ptr_mut(),
             n_rays: look.rays.n,
             n_samples: look.sampler.n_samples,

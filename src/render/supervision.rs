@@ -11,6 +11,7 @@ use crate::Result;
 use crate::config::Config;
 use crate::gpu::{Buffer, Gpu, Kernel, KernelShape, Recorder, Work};
 use crate::kernels::{mask_loss, mono_depth_loss, mono_normal_loss, sensor_depth_loss};
+use crate::model::Model;
 
 /// Kernels and results of these losses.
 pub struct Supervision {
@@ -112,7 +113,14 @@ impl Supervision {
     }
 
     /// Every loss of the batch, and what its picture hears from all of them together.
-    pub fn run(&self, rec: &mut Recorder, views: &ViewTable, composite: &Composite, look: &Look) {
+    pub fn run(
+        &self,
+        rec: &mut Recorder,
+        model: &Model,
+        views: &ViewTable,
+        composite: &Composite,
+        look: &Look,
+    ) {
         let n = self.n_rays;
         let per_ray = Work::items(u64::from(n)).flops(40.0).bytes(40.0);
         rec.fill(&self.d_image, 0..self.d_image.len(), 0);
@@ -159,7 +167,7 @@ impl Supervision {
             rec.run(&loss.kernel, work, args);
         }
         if let Some(loss) = &self.mono_normal {
-            composite.normal_map(rec, look);
+            composite.normal_map(rec, look, model);
             let args = mono_normal_loss::Args {
                 views: views.table(),
                 ray_view: look.rays.view.ptr(),
