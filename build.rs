@@ -550,12 +550,8 @@ fn rust_struct(
 fn rust_type(ty: &Type) -> String {
     match ty {
         Type::F32 => "f32".into(),
-        Type::F16 => "half::f16".into(),
         Type::U32 => "u32".into(),
         Type::I32 => "i32".into(),
-        Type::U16 => "u16".into(),
-        Type::U8 => "u8".into(),
-        Type::U64 => "[u32; 2]".into(),
         Type::Vector(element, count) | Type::Array(element, count) => {
             format!("[{}; {count}]", rust_type(element))
         }

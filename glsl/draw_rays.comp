@@ -21,6 +21,12 @@ layout(push_constant, scalar) uniform Args {
     uint one_view;     // 1: all rays are of the view that the first draw chooses
 };
 
+// Colour in [0,1] and weight of a pixel: 1, or 0 where masks are used and leave it out.
+vec4 pixel_target(View view, uvec2 pixel) {
+    vec4 rgba = unpackUnorm4x8(view.pixels.at[pixel.y * view.width + pixel.x]);
+    return vec4(rgba.rgb, use_mask == 0u || rgba.a >= 0.5 ? 1.0 : 0.0);
+}
+
 void main() {
     uint index = item();
     if (index >= n) return;
@@ -34,7 +40,7 @@ void main() {
     View view = views.at[below];
     uvec2 pixel = drawn_pixel(view, pixel_draws, index, n);
     Ray ray = pixel_ray(view, pixel, region_shape, half_extents);
-    vec4 wanted = pixel_target(view, pixel, use_mask);
+    vec4 wanted = pixel_target(view, pixel);
     set_vector(origins, index, n, ray.origin);
     set_vector(directions, index, n, ray.direction);
     near_far.at[index] = ray.near;

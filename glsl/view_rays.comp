@@ -10,13 +10,10 @@ layout(push_constant, scalar) uniform Args {
     F32sMut near_far;    // [2, n]
     U32sMut ray_view;    // [n] all set to appearance_view
     U32sMut ray_outside; // [n] 1 where the ray misses the region
-    F32sMut target;      // [4, n] red, green, blue, weight; untouched where with_target is 0
     uint n;
     uint view;            // entry of views
     uint first;           // pixel
     uint appearance_view; // the training view whose appearance code colours these rays
-    uint with_target;     // 0: the view has no pixels, or nobody asks for them
-    uint use_mask;        // 0: every pixel counts
     uint region_shape;    // 0: unit sphere, 1: box
     vec3 half_extents;    // of the box
 };
@@ -34,8 +31,4 @@ void main() {
     near_far.at[n + index] = ray.far;
     ray_view.at[index] = appearance_view;
     ray_outside.at[index] = ray.outside;
-    if (with_target != 0u) {
-        vec4 wanted = pixel_target(camera, pixel, use_mask);
-        [[unroll]] for (uint channel = 0u; channel < 4u; channel++) target.at[channel * n + index] = wanted[channel];
-    }
 }

@@ -298,13 +298,10 @@ impl Rays {
             near_far: self.near_far.ptr_mut(),
             ray_view: self.view.ptr_mut(),
             ray_outside: self.outside.ptr_mut(),
-            target: self.target.ptr_mut(),
             n: self.n,
             view,
             first,
             appearance_view: appearance_row,
-            with_target: 0,
-            use_mask: 0,
             region_shape: self.region_shape,
             half_extents: self.half_extents,
         };

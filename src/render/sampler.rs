@@ -169,7 +169,7 @@ impl Sampler {
                 near_far: rays.near_far.ptr(),
                 loss: loss.ptr_mut(),
                 d_raw: b.d_raw.ptr_mut(),
-                transmittance: b.cumulative.ptr_mut(),
+                transmittance: b.transmittance.ptr_mut(),
                 n: rays.n,
                 n_final: self.n_samples,
                 n_samples: proposal.n_samples,
