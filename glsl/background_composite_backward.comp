@@ -13,7 +13,7 @@ layout(push_constant, scalar) uniform Args {
     F32sMut d_raw;   // [n]
     F32sMut d_rgb;   // [3, n]
     uint n_rays;
-    uint n_samples;
+    uint n_samples; // n = n_rays n_samples
 };
 
 void main() {

@@ -9,7 +9,7 @@ layout(push_constant, scalar) uniform Args {
     F32s rgb;        // [3, n]
     F32sMut color;   // [3, n_rays]
     uint n_rays;
-    uint n_samples;
+    uint n_samples; // n = n_rays n_samples
 };
 
 void main() {

@@ -13,9 +13,9 @@ layout(push_constant, scalar) uniform Args {
     F32s near_far;     // [2, n_rays]
     F32s draws;        // [n_rays, n_samples + 1]
     F32sMut edges;     // [n_rays, n_samples + 1] distances t
-    F32sMut points;    // [3, n_rays * n_samples]
+    F32sMut points;    // [3, n]
     uint n_rays;
-    uint n_samples;
+    uint n_samples; // n = n_rays n_samples
     float far;
     uint jittered;
 };

@@ -5,10 +5,10 @@
 
 layout(push_constant, scalar) uniform Args {
     F32s weights;     // [n_rays, n_samples]
-    F32s gradient;    // [3, n_rays * n_samples] g
+    F32s gradient;    // [3, n] g
     F32sMut normals;  // [3, n_rays]
     uint n_rays;
-    uint n_samples;
+    uint n_samples; // n = n_rays n_samples
 };
 
 void main() {

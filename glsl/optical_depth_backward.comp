@@ -19,7 +19,7 @@ layout(push_constant, scalar) uniform Args {
     F32sMut d_scale;    // [n], also where there is one scale for all: its summands
     F32sMut d_gradient; // [3, n], with GRADIENT; zero for the Laplace density of f
     uint n_rays;
-    uint n_samples;
+    uint n_samples; // n = n_rays n_samples
     float scale_range;
     float scale_floor;
     float inv_s_lower;

@@ -70,9 +70,9 @@ Ray pixel_ray(View view, uvec2 pixel, uint region_shape, vec3 half_extents) {
     return ray;
 }
 
-// The pixel of a view that ray `index` of `n` was drawn at: column = floor(u_1 width), row = floor(u_2 height).
-uvec2 drawn_pixel(View view, F32s pixel_draws, uint index, uint n) {
+// The pixel of a view that ray `index` of `n_rays` was drawn at: column = floor(u_1 width), row = floor(u_2 height).
+uvec2 drawn_pixel(View view, F32s pixel_draws, uint index, uint n_rays) {
     uvec2 size = uvec2(view.width, view.height);
-    uvec2 pixel = uvec2(vec2(pixel_draws.at[n + index], pixel_draws.at[2u * n + index]) * vec2(size));
+    uvec2 pixel = uvec2(vec2(pixel_draws.at[n_rays + index], pixel_draws.at[2u * n_rays + index]) * vec2(size));
     return min(pixel, size - 1u); // the product may round up to the size
 }

@@ -104,7 +104,7 @@ impl Composite {
             background: look.background.color.ptr(),
             weights: self.weights.ptr_mut(),
             image: self.image.ptr_mut(),
-            n,
+            n_rays: n,
             n_samples,
         };
         rec.run(&self.forward, per_ray(n, n_samples), args);
@@ -136,7 +136,7 @@ impl Composite {
             d_optical_depth: surface.d_sdf.ptr_mut(),
             d_rgb: surface.d_rgb.ptr_mut(),
             d_background: look.background.d_color.ptr_mut(),
-            n,
+            n_rays: n,
             n_samples,
         };
         rec.run(&self.backward, per_ray(n, 2 * n_samples), args);

@@ -114,7 +114,7 @@ impl Loss {
             loss: self.color.ptr_mut(),
             square: self.square.ptr_mut(),
             d_color: self.d_color.ptr_mut(),
-            n: self.n_rays,
+            n_rays: self.n_rays,
             scale: 1.0 / self.n_rays as f32,
         };
         rec.run(
@@ -137,7 +137,7 @@ impl Loss {
             queries: self.queries.ptr_mut(),
             gate: self.gate.ptr_mut(),
             heaviest: self.heaviest.ptr_mut(),
-            n: self.n_rays,
+            n_rays: self.n_rays,
             n_samples: self.n_samples,
             eps: self.epsilon,
             offset: self.offset,
@@ -170,7 +170,7 @@ impl Loss {
             gate: self.gate.ptr(),
             loss: self.bias.ptr_mut(),
             d_query_sdf: self.d_query_sdf.ptr_mut(),
-            n: self.n_rays,
+            n_rays: self.n_rays,
             eps: self.epsilon,
             scale: weight / self.n_rays as f32,
             published: self.published,

@@ -131,7 +131,7 @@ impl Supervision {
                 ray_outside: look.rays.outside.ptr(),
                 loss: loss.values.ptr_mut(),
                 d_image: self.d_image.ptr_mut(),
-                n,
+                n_rays: n,
                 scale: loss.scale,
             };
             rec.run(&loss.kernel, per_ray, args);
@@ -147,7 +147,7 @@ impl Supervision {
                 ray_outside: look.rays.outside.ptr(),
                 loss: loss.values.ptr_mut(),
                 d_image: self.d_image.ptr_mut(),
-                n,
+                n_rays: n,
                 scale: loss.scale,
             };
             rec.run(&loss.kernel, per_ray, args);
@@ -160,7 +160,7 @@ impl Supervision {
                 ray_outside: look.rays.outside.ptr(),
                 loss: loss.values.ptr_mut(),
                 d_image: self.d_image.ptr_mut(),
-                n,
+                n_rays: n,
                 scale: loss.scale,
             };
             let work = Work::items(1).bytes(100.0 * f64::from(n));
@@ -177,7 +177,7 @@ impl Supervision {
                 ray_outside: look.rays.outside.ptr(),
                 loss: loss.values.ptr_mut(),
                 d_image: self.d_image.ptr_mut(),
-                n,
+                n_rays: n,
                 scale: loss.scale,
             };
             rec.run(&loss.kernel, per_ray, args);

@@ -252,7 +252,7 @@ impl Rays {
                 ray_view: self.view.ptr_mut(),
                 ray_outside: self.outside.ptr_mut(),
                 target: self.target.ptr_mut(),
-                n: n as u32,
+                n_rays: n as u32,
                 n_views: shares.len() as u32,
                 use_mask,
                 region_shape: if half.is_some() { BOX } else { SPHERE },
@@ -414,7 +414,7 @@ fn rays_of_a_view() {
             near_far: rays.near_far.ptr_mut(),
             ray_view: rays.view.ptr_mut(),
             ray_outside: rays.outside.ptr_mut(),
-            n,
+            n_rays: n,
             view: view as u32,
             first,
             appearance_view: 5,
@@ -494,7 +494,7 @@ fn priors_are_drawn_with_their_pixels() {
                 ray_view: rays.view.ptr(),
                 directions: rays.directions.ptr(),
                 priors: priors.ptr_mut(),
-                n: n as u32,
+                n_rays: n as u32,
             },
         );
         let camera = &picture.camera;
