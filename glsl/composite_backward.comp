@@ -8,7 +8,7 @@
 //     g_i = d_color . (1.002 rgb_i - 0.001),  g_end = d_color . background                  what one unit of weight is worth
 //     D_i = g_i - g_{i+1} + e^-tau_{i+1} D_{i+1}, from g_n = g_end, D_n = 0                 and how much more than all that it hides
 //     d_tau_i = T_{i+1} D_i,  d_rgb_i = 1.002 w_i d_color,  d_background = T_end d_color
-// Where losses hear more of a ray than its colour,
+// Where there are losses on more of a ray than its colour,
 //     g_i also has d_depth ((t_i + t_{i+1})/2 - depth)/(sum_i w_i + 1e-10) + d_normal . n_i,  g_end has -d_accumulation
 // since the accumulation is 1 - T_end: added to every g_i instead it would take the digits of their differences.
 // The textbook's T_{i+1} g_i - sum_{j>i} w_j g_j - T_end g_end is the same number, but cancels where neighbours have nearly one colour.

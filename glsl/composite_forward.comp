@@ -2,6 +2,7 @@
 #include "lib/prelude.glsl"
 #include "lib/sampling.glsl"
 #include "lib/volume.glsl"
+#include "lib/image.glsl"
 // From optical depths and colours to the picture, one invocation per ray (Mildenhall et al. 2020, NeRF, equation 3):
 //     T_i = exp(-sum_{j<i} tau_j),  w_i = (1 - e^-tau_i) T_i
 //     color = sum_i w_i (1.002 rgb_i - 0.001) + T_end background,  accumulation = sum_i w_i = 1 - T_end
@@ -14,7 +15,7 @@ layout(push_constant, scalar) uniform Args {
     F32s rgb;           // [3, n] in [0,1]
     F32s background;    // [3, n_rays]
     F32sMut weights;    // [n_rays, n_samples]
-    F32sMut image;      // [6, n_rays]: red, green, blue, accumulation, T_end, depth (distance along the ray, region units)
+    F32sMut image;      // [6, n_rays] lib/image.glsl
     uint n_rays;
     uint n_samples; // n = n_rays n_samples
 };
@@ -43,7 +44,7 @@ void main() {
 
     float accumulation = opacity(tau_sum);
     set_vector(image, ray, n_rays, color + transmittance * vector_at(background, ray, n_rays));
-    image.at[3u * n_rays + ray] = accumulation;
-    image.at[4u * n_rays + ray] = transmittance;
-    image.at[5u * n_rays + ray] = weighted_distance / (accumulation + 1e-10);
+    image.at[IMAGE_ACCUMULATION * n_rays + ray] = accumulation;
+    image.at[IMAGE_TRANSMITTANCE * n_rays + ray] = transmittance;
+    image.at[IMAGE_DEPTH * n_rays + ray] = weighted_distance / (accumulation + 1e-10);
 }

@@ -8,7 +8,7 @@ layout(push_constant, scalar) uniform Args {
     F32s weights;       // [n_rays, n_samples]
     F32s gradient;      // [3, n]
     F32s d_image;       // [5, n_rays] the last three planes are the normal's
-    F32sMut d_gradient; // [3, n] added to
+    F32sMut d_gradient; // [3, n] accumulated
     uint n_rays;
     uint n_samples; // n = n_rays n_samples
 };

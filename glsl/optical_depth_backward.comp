@@ -5,7 +5,7 @@
 #include "lib/volume.glsl"
 #include "lib/optical_depth.glsl"
 
-layout(constant_id = 2) const uint GRADIENT = 0;  // 1: there is somebody to hear d_gradient
+layout(constant_id = 2) const uint GRADIENT = 0;  // 1: d_gradient is wanted
 
 layout(push_constant, scalar) uniform Args {
     F32s sdf;         // [n]

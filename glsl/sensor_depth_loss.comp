@@ -9,7 +9,7 @@ layout(push_constant, scalar) uniform Args {
     F32s target;      // [4, n_rays]
     U32s ray_outside; // [n_rays]
     F32sMut loss;     // [n_rays] before scale
-    F32sMut d_image;  // [5, n_rays] added to
+    F32sMut d_image;  // [5, n_rays] accumulated
     uint n_rays;
     float scale; // the loss's weight / number of rays
 };

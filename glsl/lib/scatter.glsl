@@ -3,7 +3,7 @@
 
 layout(constant_id = 0) const uint LEVELS = 12;
 layout(constant_id = 1) const uint FEATURES = 2;
-layout(constant_id = 2) const uint SECOND_ORDER = 0;  // the table hears from the field's gradient g = Jᵀ a too
+layout(constant_id = 2) const uint SECOND_ORDER = 0;  // there is a gradient through the field's gradient g = Jᵀ a, too
 
 layout(push_constant, scalar) uniform Args {
     Levels levels;

@@ -20,7 +20,7 @@ pub struct Composite {
     forward: Kernel<composite_forward::Args>,
     backward: Kernel<composite_backward::Args>,
     normal_map: Kernel<normal_map::Args>,
-    /// Where a loss hears of normals.
+    /// Where there is a loss on normals.
     normal_map_backward: Option<Kernel<normal_map_backward::Args>>,
     optical_depth: Buffer<f32>, // [n_rays, n_samples]
     optical_depth_forward: Kernel<optical_depth::Args>,
@@ -63,7 +63,7 @@ impl Composite {
             optical_depth_backward: gpu.kernel(optical_depth_backward::Shape {
                 density,
                 scale,
-                gradient: u32::from(Surface::gradient_is_heard(config)),
+                gradient: u32::from(Surface::gradient_has_other_uses(config)),
             })?,
             scale_range: match config.surface.scale {
                 ScaleKind::Exponential => config.surface.scale_rate,
@@ -111,7 +111,7 @@ impl Composite {
     }
 
     /// Gradients of SDF (block 0), scale, colour and background, and where density or rendered normals read it, of the SDF's gradient,
-    /// from `d_color [3, n_rays]` and, where there are such losses, what else a picture hears: `d_image [5, n_rays]`.
+    /// from `d_color [3, n_rays]` and, where there are losses on more than colour, `d_image [5, n_rays]`.
     pub fn backward(
         &self,
         rec: &mut Recorder,

@@ -248,7 +248,7 @@ impl Loss {
         let args = sum_losses::Args {
             terms: self.terms.ptr(),
             losses: self.sums.ptr_mut(),
-            non_finite: self.bad_step.ptr_mut(),
+            bad_step: self.bad_step.ptr_mut(),
             n_terms: TERMS.len() as u32,
         };
         rec.run(

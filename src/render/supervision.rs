@@ -15,7 +15,7 @@ use crate::model::Model;
 
 /// Kernels and results of these losses.
 pub struct Supervision {
-    /// What the picture hears from them.
+    /// Their gradients by what is rendered.
     pub d_image: Buffer<f32>, // [5, n_rays] glsl/lib/supervision.glsl
     pub priors: Option<Priors>,
     mask: Option<RayLoss<mask_loss::Args>>,
@@ -112,7 +112,7 @@ impl Supervision {
         Ok(Some(supervision))
     }
 
-    /// Every loss of the batch, and what its picture hears from all of them together.
+    /// Every loss of the batch, and in `d_image` the gradients of all of them together.
     pub fn run(
         &self,
         rec: &mut Recorder,

@@ -322,9 +322,9 @@ fn loss_sums() {
     };
     let terms: Vec<_> = buffers.iter().zip(1..).map(term).collect();
     let table = device.table("terms", &terms);
-    let (losses, non_finite) = (
+    let (losses, bad_step) = (
         device.room("losses", terms.len() + 1),
-        device.table("non_finite", &[0]),
+        device.table("bad_step", &[0]),
     );
     let sum = || {
         device.run(
@@ -333,7 +333,7 @@ fn loss_sums() {
             kernels::sum_losses::Args {
                 terms: table.ptr(),
                 losses: losses.ptr_mut(),
-                non_finite: non_finite.ptr_mut(),
+                bad_step: bad_step.ptr_mut(),
                 n_terms: terms.len() as u32,
             },
         );
@@ -348,11 +348,11 @@ fn loss_sums() {
     let got = sum();
     assert_forward("losses", &got, &want);
     assert_eq!(got, sum(), "the same values, the same sums");
-    assert_eq!(device.read(&non_finite), [0]);
+    assert_eq!(device.read(&bad_step), [0]);
     device
         .gpu
         .upload(&buffers[2], 200, &[f32::NAN])
         .expect("upload");
     sum();
-    assert_eq!(device.read(&non_finite), [1]);
+    assert_eq!(device.read(&bad_step), [1]);
 }
