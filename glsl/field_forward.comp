@@ -7,8 +7,8 @@
 #include "lib/hash_grid.glsl"
 #include "lib/field.glsl"
 
-// 1: the first n_hidden points have further heads; 0: none at hand has. (lavapipe asks every lane at every access whether it has: a launch
-// for those that have and one for the others is faster.)
+// 1: the first n_hidden points have further heads; 0: none at hand has. (With 1 lavapipe branches per lane at every store of h: a launch for
+// those that have and one for the others is faster.)
 layout(constant_id = 7) const uint HEADS = 1;
 layout(constant_id = 8) const uint PART = 0;      // 0 everything, 1 the encoding of one level per slice, 2 the network
 layout(constant_id = 9) const uint STRAIGHT = 0;
@@ -55,8 +55,8 @@ void main() {
         }
     }
     if (PART == 1u) return;
-    // The loop's arguments are read before it: a software device asks at every reading whether the launch has so many, and where such a
-    // question stands the sums are torn from their products.
+    // Copied to locals before the loop: lavapipe bounds-checks every read of a push constant by a branch, behind which it then computes the
+    // sums that are used there, while their products wait on the stack.
     F32s hidden_weight = hidden_weight, hidden_bias = hidden_bias, head_weight = head_weight;
     F32sMut hidden = hidden;
     uint n_hidden = n_hidden;

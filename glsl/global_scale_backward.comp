@@ -1,7 +1,7 @@
 #version 460
 #define LOCAL_SIZE 256
-// The gradient of the one scale that all samples share: the sum of its summands, which leave zeros behind, since they stand where the
-// network's own logit would have its gradient. One workgroup, fixed order.
+// Gradient of the one scale that all samples share: the sum of what each sample adds to it. These summands lie in the row of the network's
+// scale logit, which has no gradient then, so zeros are left there. ONE workgroup, fixed order.
 #include "lib/prelude.glsl"
 #include "lib/sums.glsl"
 #include "lib/workgroup_sum.glsl"

@@ -3,9 +3,8 @@
 #include "lib/prelude.glsl"
 #include "lib/scalar.glsl"
 #include "lib/workgroup_sum.glsl"
-// Sums of loss arrays: losses[k] = scale_k * sum of term k's values, losses[n_terms] = the total
-// of those that count. ONE workgroup, fixed order: the same
-// values give the same sums in every run. bad_step is set where a sum is not a number or infinite, and never cleared here.
+// Sums of loss arrays: losses[k] = scale_k * sum of term k's values, losses[n_terms] = the total of those that count. ONE workgroup, fixed
+// order: the same values give the same sums in every run. bad_step is set where the total is not finite, and never cleared here.
 struct LossTerm {
     F32s values; // [count]
     uint count;
@@ -18,7 +17,7 @@ layout(buffer_reference, scalar, buffer_reference_align = 8) readonly buffer Los
 layout(push_constant, scalar) uniform Args {
     LossTerms terms;     // [n_terms]
     F32sMut losses;      // [n_terms + 1]
-    U32sMut bad_step;  // [1] 1 once any sum was not finite
+    U32sMut bad_step;    // [1] 1 once a total was not finite
     uint n_terms;
 };
 

@@ -1,7 +1,7 @@
 // What every kernel begins with: extensions, workgroup size, pointer types, the item that this invocation works on.
 //
-// A kernel's first line is `#version 460`, its second includes this file; `#define LOCAL_SIZE n` between the two changes the workgroup
-// size. Files are included once, however often they are named, so they need no guards.
+// A kernel includes it before all other files; `#define LOCAL_SIZE n` above that changes the workgroup size. Files are included once,
+// however often they are named, so they need no guards.
 
 #extension GL_EXT_buffer_reference2 : require
 #extension GL_EXT_buffer_reference_uvec2 : require
