@@ -181,7 +181,7 @@ fn form(glsl: &Path, path: &Path, out: &Path) -> Result<(Source, Module), String
             ));
         }
     }
-    if source.takes(SUMS) {
+    if source.declares(SUMS) {
         compiled(&source, stem, DETERMINISTIC, out)?;
     }
     Ok((source, module))
@@ -213,8 +213,8 @@ impl Source {
         Ok(source)
     }
 
-    /// Whether an argument of the kernel is of this type.
-    fn takes(&self, ty: &str) -> bool {
+    /// Whether the kernel has an argument or a variable of this type.
+    fn declares(&self, ty: &str) -> bool {
         let mut lines = self.text.lines();
         lines.any(|line| line.trim_start().starts_with(ty))
     }
@@ -454,7 +454,7 @@ fn kernel_module(stem: &str, source: &Source, module: &Module, cooperative: &str
         true => format!("Some({})", embed(CORE_ONLY)),
         false => "None".into(),
     };
-    let deterministic = match source.takes(SUMS) {
+    let deterministic = match source.declares(SUMS) {
         true => format!("Some({})", embed(DETERMINISTIC)),
         false => "None".into(),
     };
@@ -550,12 +550,8 @@ fn rust_struct(
 fn rust_type(ty: &Type) -> String {
     match ty {
         Type::F32 => "f32".into(),
-        Type::F16 => "half::f16".into(),
         Type::U32 => "u32".into(),
         Type::I32 => "i32".into(),
-        Type::U16 => "u16".into(),
-        Type::U8 => "u8".into(),
-        Type::U64 => "[u32; 2]".into(),
         Type::Vector(element, count) | Type::Array(element, count) => {
             format!("[{}; {count}]", rust_type(element))
         }

@@ -5,23 +5,23 @@
 #include "lib/adam.glsl"
 
 layout(push_constant, scalar) uniform Args {
-    F32sMut params;       // [n] updated in place
-    SumsMut grads;        // [n] consumed: zeroed for the next step
-    F32sMut first_moment; // [n]
+    F32sMut params;        // [n] updated in place
+    SumsMut grads;         // [n] consumed: zeroed for the next step
+    F32sMut first_moment;  // [n]
     F32sMut second_moment; // [n]
-    U32s bad_step;        // [1] non-zero: losses not finite
-    uint n;               // where odd, padding goes along: it is zero and stays so
-    float rate;           // η / (1 − β₁ᵗ)
-    float decay;          // η λ
-    float correction;     // √(1 − β₂ᵗ)
-    float share1;         // 1 − β₁
-    float share2;         // 1 − β₂
+    U32s bad_step;         // [1] non-zero: losses not finite
+    uint n;                // where odd, padding goes along: it is zero and stays so
+    float rate;            // η / (1 − β₁ᵗ)
+    float decay;           // η λ
+    float correction;      // √(1 − β₂ᵗ)
+    float one_minus_beta1; // 1 − β₁
+    float one_minus_beta2; // 1 − β₂
     float epsilon;
 };
 
 void main() {
     uint i = 2u * item();
     if (i >= n) return;
-    Rates rates = Rates(rate, decay, correction, share1, share2, epsilon);
+    Rates rates = Rates(rate, decay, correction, one_minus_beta1, one_minus_beta2, epsilon);
     update_pair(params, grads, first_moment, second_moment, i, bad_step.at[0] != 0u, rates);
 }

@@ -4,11 +4,11 @@
 #include "lib/sums.glsl"
 
 layout(push_constant, scalar) uniform Args {
-    F32s d_code;         // [channels, n_rays * n_samples]
+    F32s d_code;         // [channels, n]
     U32s ray_view;       // [n_rays]
     SumsMut d_appearance; // [views, channels] accumulated
     uint n_rays;
-    uint n_samples;
+    uint n_samples; // n = n_rays n_samples
     uint channels;
 };
 

@@ -1,33 +1,33 @@
 #version 460
 // Adjoint of background_composite_forward, one ray per invocation, by the recursion of composite_backward from the back:
-//   g_i = d_color · c_i (0 behind the last sample),  D_i = g_i − g_{i+1} + e^{−τ_{i+1}} D_{i+1},  d_τ_i = T_{i+1} D_i,  ∂τ_i/∂out_i = τ_i.
+//   g_i = d_color · c_i (0 behind the last sample),  D_i = g_i − g_{i+1} + e^{−τ_{i+1}} D_{i+1},  d_τ_i = T_{i+1} D_i,  d_out_i = τ_i d_τ_i.
 // Nothing is subtracted from a running sum: far bins are hundreds of units long, and τ_i would multiply what rounding leaves of it.
 #include "lib/prelude.glsl"
+#include "lib/volume.glsl"
 
 layout(push_constant, scalar) uniform Args {
     F32s edges;      // [n_rays, n_samples + 1]
     F32s raw;        // [n]
     F32s rgb;        // [3, n]
-    F32s color;      // [3, n_rays]
     F32s d_color;    // [3, n_rays]
     F32sMut d_raw;   // [n]
     F32sMut d_rgb;   // [3, n]
     uint n_rays;
-    uint n_samples;
+    uint n_samples; // n = n_rays n_samples
 };
 
 void main() {
     uint ray = item();
     if (ray >= n_rays) return;
     uint n = n_rays * n_samples;
-    vec3 d_c = vec3(d_color.at[ray], d_color.at[n_rays + ray], d_color.at[2u * n_rays + ray]);
+    vec3 d_c = vector_at(d_color, ray, n_rays);
 
     // Forward: the transmittance after each sample, left in d_raw until the way back overwrites it.
     float depth = 0.0;
     for (uint s = 0u; s < n_samples; ++s) {
         uint p = ray * n_samples + s;
         uint e = ray * (n_samples + 1u) + s;
-        depth += exp(min(raw.at[p], 15.0)) * (edges.at[e + 1u] - edges.at[e]);
+        depth += background_density(raw.at[p]) * (edges.at[e + 1u] - edges.at[e]);
         d_raw.at[p] = exp(-depth);
     }
 
@@ -36,17 +36,14 @@ void main() {
         uint s = n_samples - 1u - k;
         uint p = ray * n_samples + s;
         uint e = ray * (n_samples + 1u) + s;
-        float out_ = raw.at[p];
-        float tau = exp(min(out_, 15.0)) * (edges.at[e + 1u] - edges.at[e]);
-        float w = 1.0 - exp(-tau);
+        float bin = edges.at[e + 1u] - edges.at[e];
+        float tau = background_density(raw.at[p]) * bin;
+        float w = opacity(tau);
         if (s > 0u) w *= d_raw.at[p - 1u];
-        float worth = 0.0;
-        [[unroll]] for (uint c = 0u; c < 3u; ++c) {
-            worth += d_c[c] * rgb.at[c * n + p];
-            d_rgb.at[c * n + p] = w * d_c[c];
-        }
+        float worth = dot(d_c, vector_at(rgb, p, n));
+        set_vector(d_rgb, p, n, w * d_c);
         advantage = worth - next_worth + passed * advantage;
-        d_raw.at[p] = out_ > 15.0 ? 0.0 : tau * d_raw.at[p] * advantage;
+        d_raw.at[p] *= advantage * bin * background_density_slope(raw.at[p]);
         next_worth = worth;
         passed = exp(-tau);
     }

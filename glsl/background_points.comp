@@ -13,9 +13,9 @@ layout(push_constant, scalar) uniform Args {
     F32s near_far;     // [2, n_rays]
     F32s draws;        // [n_rays, n_samples + 1]
     F32sMut edges;     // [n_rays, n_samples + 1] distances t
-    F32sMut points;    // [3, n_rays * n_samples]
+    F32sMut points;    // [3, n]
     uint n_rays;
-    uint n_samples;
+    uint n_samples; // n = n_rays n_samples
     float far;
     uint jittered;
 };
@@ -32,8 +32,8 @@ float edge_at(uint ray, uint j, float exit) {
 void main() {
     uint ray = item();
     if (ray >= n_rays) return;
-    vec3 o = vec3(origins.at[ray], origins.at[n_rays + ray], origins.at[2u * n_rays + ray]);
-    vec3 d = vec3(directions.at[ray], directions.at[n_rays + ray], directions.at[2u * n_rays + ray]);
+    vec3 o = vector_at(origins, ray, n_rays);
+    vec3 d = vector_at(directions, ray, n_rays);
     float exit = max(near_far.at[n_rays + ray], 1e-3);
     uint n = n_rays * n_samples;
     float start = edge_at(ray, 0u, exit);
@@ -48,6 +48,6 @@ void main() {
             if (norm > 1.0) x *= (2.0 - 1.0 / norm) / norm;
             x *= 0.5;
         }
-        [[unroll]] for (uint c = 0u; c < 3u; ++c) points.at[c * n + ray * n_samples + s] = x[c];
+        set_vector(points, ray * n_samples + s, n, x);
     }
 }

@@ -17,7 +17,7 @@ void main() {
     uint p = item();
     if (p >= n) return;
     uint ray = p / (n / n_rays);
-    vec3 d = vec3(directions.at[ray], directions.at[n_rays + ray], directions.at[2u * n_rays + ray]);
+    vec3 d = vector_at(directions, ray, n_rays);
     float x = d.x, y = d.y, z = d.z, xx = x * x, yy = y * y, zz = z * z;
     // √(1/4π), √(3/4π), √(15/4π), √(5/16π), √(15/16π), √(35/32π), √(105/4π), √(21/32π), √(7/16π), √(105/16π)
     float harmonics[16] = float[16](

@@ -8,33 +8,33 @@
 //     g_i = d_color . (1.002 rgb_i - 0.001),  g_end = d_color . background                  what one unit of weight is worth
 //     D_i = g_i - g_{i+1} + e^-tau_{i+1} D_{i+1}, from g_n = g_end, D_n = 0                 and how much more than all that it hides
 //     d_tau_i = T_{i+1} D_i,  d_rgb_i = 1.002 w_i d_color,  d_background = T_end d_color
-// Where losses hear more of a ray than its colour,
+// Where there are losses on more of a ray than its colour,
 //     g_i also has d_depth ((t_i + t_{i+1})/2 - depth)/(sum_i w_i + 1e-10) + d_normal . n_i,  g_end has -d_accumulation
 // since the accumulation is 1 - T_end: added to every g_i instead it would take the digits of their differences.
 // The textbook's T_{i+1} g_i - sum_{j>i} w_j g_j - T_end g_end is the same number, but cancels where neighbours have nearly one colour.
 layout(constant_id = 0) const uint SUPERVISED = 0; // 1: there are such losses
 
 layout(push_constant, scalar) uniform Args {
-    F32s optical_depth;      // [n * n_samples] tau
-    F32s rgb;                // [3, n * n_samples] in [0,1]
-    F32s background;         // [3, n]
-    F32s d_color;            // [3, n]
-    F32s edges;              // [n, n_samples + 1], this and the next four with SUPERVISED
-    F32s near_far;           // [2, n]
-    F32s image;              // [6, n] of composite_forward
-    F32s gradient;           // [3, n * n_samples] of the signed distance
-    F32s d_image;            // [5, n] lib/supervision.glsl
-    F32sMut d_optical_depth; // [n * n_samples]
-    F32sMut d_rgb;           // [3, n * n_samples] with respect to the colour before padding
-    F32sMut d_background;    // [3, n]
-    uint n;
-    uint n_samples;
+    F32s optical_depth;      // [n] tau
+    F32s rgb;                // [3, n] in [0,1]
+    F32s background;         // [3, n_rays]
+    F32s d_color;            // [3, n_rays]
+    F32s edges;              // [n_rays, n_samples + 1], this and the next four with SUPERVISED
+    F32s near_far;           // [2, n_rays]
+    F32s image;              // [6, n_rays] of composite_forward
+    F32s gradient;           // [3, n] of the signed distance
+    F32s d_image;            // [5, n_rays] lib/supervision.glsl
+    F32sMut d_optical_depth; // [n]
+    F32sMut d_rgb;           // [3, n] with respect to the colour before padding
+    F32sMut d_background;    // [3, n_rays]
+    uint n_rays;
+    uint n_samples; // n = n_rays n_samples
 };
 
 void main() {
     uint ray = item();
-    if (ray >= n) return;
-    uint count = n * n_samples;
+    if (ray >= n_rays) return;
+    uint n = n_rays * n_samples;
     uint row = ray * n_samples;
 
     // Forward: the transmittance after each sample, left in d_optical_depth until the way back overwrites it.
@@ -45,21 +45,20 @@ void main() {
         d_optical_depth.at[row + i] = transmittance;
     }
 
-    vec3 d_pixel = vec3(d_color.at[ray], d_color.at[n + ray], d_color.at[2u * n + ray]);
-    vec3 behind = vec3(background.at[ray], background.at[n + ray], background.at[2u * n + ray]);
-    [[unroll]] for (uint channel = 0u; channel < 3u; channel++)
-        d_background.at[channel * n + ray] = transmittance * d_pixel[channel];
+    vec3 d_pixel = vector_at(d_color, ray, n_rays);
+    vec3 behind = vector_at(background, ray, n_rays);
+    set_vector(d_background, ray, n_rays, transmittance * d_pixel);
 
     float d_accumulation = 0.0, d_depth = 0.0, depth = 0.0, s1 = 0.0;
     vec3 d_normal = vec3(0.0);
     Span span = Span(0.0, 0.0);
     if (SUPERVISED != 0u) {
-        span = ray_span(near_far, n, ray);
+        span = ray_span(near_far, n_rays, ray);
         s1 = edges.at[row + ray + n_samples];
-        depth = image.at[IMAGE_DEPTH * n + ray];
-        d_accumulation = d_image.at[D_ACCUMULATION * n + ray];
-        d_depth = d_image.at[D_DEPTH * n + ray] / (image.at[IMAGE_ACCUMULATION * n + ray] + 1e-10);
-        [[unroll]] for (uint axis = 0u; axis < 3u; axis++) d_normal[axis] = d_image.at[(D_NORMAL + axis) * n + ray];
+        depth = image.at[IMAGE_DEPTH * n_rays + ray];
+        d_accumulation = d_image.at[D_ACCUMULATION * n_rays + ray];
+        d_depth = d_image.at[D_DEPTH * n_rays + ray] / (image.at[IMAGE_ACCUMULATION * n_rays + ray] + 1e-10);
+        d_normal = vector_at(d_image, D_NORMAL * n_rays + ray, n_rays);
     }
 
     // Backward.
@@ -72,15 +71,12 @@ void main() {
         float weight = opacity(tau);
         if (i > 0u) weight *= d_optical_depth.at[p - 1u];
 
-        float worth = 0.0;
-        [[unroll]] for (uint channel = 0u; channel < 3u; channel++) {
-            worth += d_pixel[channel] * padded_rgb(rgb.at[channel * count + p]);
-            d_rgb.at[channel * count + p] = (1.0 + 2.0 * RGB_PADDING) * weight * d_pixel[channel];
-        }
+        float worth = dot(d_pixel, padded_rgb(vector_at(rgb, p, n)));
+        set_vector(d_rgb, p, n, (1.0 + 2.0 * RGB_PADDING) * weight * d_pixel);
         if (SUPERVISED != 0u) {
             float s0 = edges.at[p + ray];
             worth += d_depth * (bin_midpoint(span, s0, s1) - depth);
-            worth += dot(d_normal, normal_of(vector_at(gradient, p, count)));
+            worth += dot(d_normal, normal_of(vector_at(gradient, p, n)));
             s1 = s0;
         }
         advantage = worth - next_worth + passed * advantage;

@@ -26,11 +26,11 @@ layout(buffer_reference, scalar, buffer_reference_align = 8) readonly buffer Vie
 layout(push_constant, scalar) uniform Args {
     Views views;
     ViewPriorTable maps; // [training views]
-    F32s pixel_draws;    // [3, n] of draw_rays
-    U32s ray_view;       // [n]
-    F32s directions;     // [3, n]
-    F32sMut priors;      // [6, n] lib/supervision.glsl; planes of what no view has stay untouched
-    uint n;
+    F32s pixel_draws;    // [3, n_rays] of draw_rays
+    U32s ray_view;       // [n_rays]
+    F32s directions;     // [3, n_rays]
+    F32sMut priors;      // [6, n_rays] lib/supervision.glsl; planes of what no view has stay untouched
+    uint n_rays;
 };
 
 // Where the middle of a picture's pixel falls on another raster of the same picture.
@@ -41,21 +41,19 @@ uint nearest(uvec2 pixel, View view, uint width, uint height) {
 
 void main() {
     uint ray = item();
-    if (ray >= n) return;
+    if (ray >= n_rays) return;
     View view = views.at[ray_view.at[ray]];
     ViewPriors map = maps.at[ray_view.at[ray]];
-    uvec2 pixel = drawn_pixel(view, pixel_draws, ray, n);
+    uvec2 pixel = drawn_pixel(view, pixel_draws, ray, n_rays);
     float m[12] = view.region_from_camera;
-    priors.at[PRIOR_COSINE * n + ray] =
-        -(m[2] * directions.at[ray] + m[6] * directions.at[n + ray] + m[10] * directions.at[2u * n + ray]);
+    priors.at[PRIOR_COSINE * n_rays + ray] = -dot(vec3(m[2], m[6], m[10]), vector_at(directions, ray, n_rays));
     if (MONO_DEPTH != 0u)
-        priors.at[PRIOR_MONO_DEPTH * n + ray] = map.mono_depth.at[nearest(pixel, view, map.mono_depth_width, map.mono_depth_height)];
+        priors.at[PRIOR_MONO_DEPTH * n_rays + ray] = map.mono_depth.at[nearest(pixel, view, map.mono_depth_width, map.mono_depth_height)];
     if (MONO_NORMAL != 0u) {
         uint at = nearest(pixel, view, map.mono_normal_width, map.mono_normal_height);
         uint size = map.mono_normal_width * map.mono_normal_height;
-        [[unroll]] for (uint axis = 0u; axis < 3u; axis++)
-            priors.at[(PRIOR_MONO_NORMAL + axis) * n + ray] = map.mono_normal.at[axis * size + at];
+        set_vector(priors, PRIOR_MONO_NORMAL * n_rays + ray, n_rays, vector_at(map.mono_normal, at, size));
     }
     if (SENSOR_DEPTH != 0u)
-        priors.at[PRIOR_SENSOR_DEPTH * n + ray] = map.sensor_depth.at[nearest(pixel, view, map.sensor_depth_width, map.sensor_depth_height)];
+        priors.at[PRIOR_SENSOR_DEPTH * n_rays + ray] = map.sensor_depth.at[nearest(pixel, view, map.sensor_depth_width, map.sensor_depth_height)];
 }

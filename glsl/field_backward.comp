@@ -40,15 +40,15 @@ const uint OUT_INPUTS = INPUTS - FIRST_INPUT;
 const uint TANGENTS = SECOND_ORDER != 0u ? INPUTS : 1u;
 
 void main() {
-    // The loop's arguments are read before it: a software device asks at every reading whether the launch has so many, and where such a
-    // question stands the sums are torn from their products.
+    // Copied to locals before the loop: lavapipe bounds-checks every read of a push constant by a branch, behind which it then computes the
+    // sums that are used there, while their products wait on the stack.
     F32s hidden_weight = hidden_weight, hidden_bias = hidden_bias, head_weight = head_weight, d_hidden = d_hidden;
     F32sMut d_preactivation = d_preactivation, steepness = steepness;
     SumsMut d_head_weight = d_head_weight;
     uint n_hidden = n_hidden, m = m;
     uint point = begin + item();
     // Invocations past the end stay for the subgroup's sums, to which they add nothing; they do the first point once more, and write what
-    // its own invocation writes: a software device pays as much for a question around a store as for the store. (Summing up in shared
+    // its own invocation writes: a software device pays as much for a branch around a store as for the store. (Summing up in shared
     // memory first would halve its speed, too: a barrier costs more there than an atomic add.)
     bool inside = point < end;
     uint p = inside ? point : begin;

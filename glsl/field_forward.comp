@@ -7,8 +7,8 @@
 #include "lib/hash_grid.glsl"
 #include "lib/field.glsl"
 
-// 1: the first n_hidden points have further heads; 0: none at hand has. (lavapipe asks every lane at every access whether it has: a launch
-// for those that have and one for the others is faster.)
+// 1: the first n_hidden points have further heads; 0: none at hand has. (With 1 lavapipe branches per lane at every store of h: a launch for
+// those that have and one for the others is faster.)
 layout(constant_id = 7) const uint HEADS = 1;
 layout(constant_id = 8) const uint PART = 0;      // 0 everything, 1 the encoding of one level per slice, 2 the network
 layout(constant_id = 9) const uint STRAIGHT = 0;
@@ -36,13 +36,11 @@ void main() {
     uint point = begin + item();
     if (STRAIGHT != 0u) point = min(point, end - 1u);
     else if (point >= end) return;
-    vec3 x = vec3(points.at[point], points.at[n + point], points.at[2u * n + point]);
+    vec3 x = vector_at(points, point, n);
     if (PART != 2u) {
         uint first_level = PART == 1u ? level_of_slice(LEVELS) : 0u;
         uint end_level = PART == 1u ? first_level + 1u : LEVELS;
-        if (COORDINATES != 0u && first_level == 0u) {
-            [[unroll]] for (uint c = 0u; c < 3u; ++c) inputs.at[c * n + point] = x[c];
-        }
+        if (COORDINATES != 0u && first_level == 0u) set_vector(inputs, point, n, x);
         for (uint l = first_level; l < end_level; ++l) {
             Level level = levels.at[l];
             Cell cell = cell_of(level, x);
@@ -57,8 +55,8 @@ void main() {
         }
     }
     if (PART == 1u) return;
-    // The loop's arguments are read before it: a software device asks at every reading whether the launch has so many, and where such a
-    // question stands the sums are torn from their products.
+    // Copied to locals before the loop: lavapipe bounds-checks every read of a push constant by a branch, behind which it then computes the
+    // sums that are used there, while their products wait on the stack.
     F32s hidden_weight = hidden_weight, hidden_bias = hidden_bias, head_weight = head_weight;
     F32sMut hidden = hidden;
     uint n_hidden = n_hidden;

@@ -1,7 +1,7 @@
 #version 460
 // Gradient of a field's first output with respect to position, by the chain rule, one point per invocation (METHOD 3):
 //   s = σ'(u) ⊙ w₂,  a = W₁ᵀ s,  g = Jᵀ a  with J = ∂z/∂x = [I; ∂e/∂x].
-// a is kept: with it the hash table hears from g (hash_grid_backward).
+// a is kept: the hash table's gradient through g needs it (hash_grid_backward).
 #include "lib/prelude.glsl"
 #include "lib/hash_grid.glsl"
 #include "lib/field.glsl"
@@ -43,11 +43,8 @@ void main() {
     } while (first_neuron < neurons);
     [[unroll]] for (uint i = 0u; i < INPUTS; ++i) slopes.at[i * n + point] = a[i];
 
-    vec3 g = vec3(0.0);
-    if (COORDINATES != 0u) {
-        [[unroll]] for (uint c = 0u; c < 3u; ++c) g[c] = slopes.at[c * n + point];
-    }
-    vec3 x = vec3(points.at[point], points.at[n + point], points.at[2u * n + point]);
+    vec3 g = COORDINATES != 0u ? vector_at(reading(slopes), point, n) : vec3(0.0);
+    vec3 x = vector_at(points, point, n);
     for (uint l = 0u; l < LEVELS; ++l) {
         Level level = levels.at[l];
         Cell cell = cell_of(level, x);
@@ -61,5 +58,5 @@ void main() {
             g += value * corner_slope(level, cell, corner);
         }
     }
-    [[unroll]] for (uint axis = 0u; axis < 3u; ++axis) gradient.at[axis * n + point] = g[axis];
+    set_vector(gradient, point, n, g);
 }

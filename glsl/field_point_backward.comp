@@ -22,12 +22,9 @@ layout(push_constant, scalar) uniform Args {
 void main() {
     uint point = begin + item(), count = end - begin;
     if (point >= end) return;
-    vec3 x = vec3(points.at[point], points.at[n + point], points.at[2u * n + point]);
-    vec3 v = vec3(d_gradient.at[point], d_gradient.at[n + point], d_gradient.at[2u * n + point]);
-    vec3 d_x = vec3(0.0);
-    if (COORDINATES != 0u) {
-        [[unroll]] for (uint c = 0u; c < 3u; ++c) d_x[c] = d_inputs.at[c * count + item()];
-    }
+    vec3 x = vector_at(points, point, n);
+    vec3 v = vector_at(d_gradient, point, n);
+    vec3 d_x = COORDINATES != 0u ? vector_at(d_inputs, item(), count) : vec3(0.0);
     for (uint l = 0u; l < LEVELS; ++l) {
         Level level = levels.at[l];
         Cell cell = cell_of(level, x);
@@ -49,5 +46,5 @@ void main() {
             d_x += first * corner_slope(level, cell, corner) + second * corner_curvature(level, cell, corner, v);
         }
     }
-    [[unroll]] for (uint axis = 0u; axis < 3u; ++axis) d_points.at[axis * n + point] = d_x[axis];
+    set_vector(d_points, point, n, d_x);
 }

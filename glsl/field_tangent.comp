@@ -19,12 +19,10 @@ layout(push_constant, scalar) uniform Args {
 void main() {
     uint point = begin + item(), count = end - begin;
     if (point >= end) return;
-    vec3 x = vec3(points.at[point], points.at[n + point], points.at[2u * n + point]);
-    vec3 v = vec3(d_gradient.at[point], d_gradient.at[n + point], d_gradient.at[2u * n + point]);
+    vec3 x = vector_at(points, point, n);
+    vec3 v = vector_at(d_gradient, point, n);
     uint l = level_of_slice(LEVELS);
-    if (COORDINATES != 0u && l == 0u) {
-        [[unroll]] for (uint c = 0u; c < 3u; ++c) tangents.at[c * count + item()] = v[c];
-    }
+    if (COORDINATES != 0u && l == 0u) set_vector(tangents, item(), count, v);
     Level level = levels.at[l];
     Cell cell = cell_of(level, x);
     vec2 tangent[PAIRS];

@@ -1,17 +1,16 @@
 #version 460
 #define LOCAL_SIZE 256
-// The gradient of the one scale that all samples share: the sum of its summands, which leave zeros behind, since they stand where the
-// network's own logit would have its gradient. One workgroup, fixed order.
+// Gradient of the one scale that all samples share: the sum of what each sample adds to it. These summands lie in the row of the network's
+// scale logit, which has no gradient then, so zeros are left there. ONE workgroup, fixed order.
 #include "lib/prelude.glsl"
 #include "lib/sums.glsl"
+#include "lib/workgroup_sum.glsl"
 
 layout(push_constant, scalar) uniform Args {
     F32sMut d_scale;     // [n] consumed
     SumsMut d_parameter; // [1] accumulated
     uint n;
 };
-
-shared float partial[LOCAL_SIZE];
 
 void main() {
     uint lane = gl_LocalInvocationID.x;
@@ -20,11 +19,6 @@ void main() {
         sum += d_scale.at[p];
         d_scale.at[p] = 0.0;
     }
-    partial[lane] = sum;
-    barrier();
-    for (uint stride = LOCAL_SIZE / 2u; stride > 0u; stride /= 2u) {
-        if (lane < stride) partial[lane] += partial[lane + stride];
-        barrier();
-    }
-    if (lane == 0u) add_alone(d_parameter, 0u, partial[0]);
+    sum = workgroup_sum(sum);
+    if (lane == 0u) add_alone(d_parameter, 0u, sum);
 }

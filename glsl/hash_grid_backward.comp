@@ -1,6 +1,7 @@
 #version 460
-// Scatter of ∂loss/∂features into the hash table: d_table[corner] += weight · d_e, one (point, level) per invocation.
-// The level is the launch's slice: only one level's gradients need to fit the cache.
+// Scatter of ∂loss/∂features into the hash table: d_table[corner] += weight · d_e, with SECOND_ORDER also (∂weight/∂x · v) a, that of
+// ∂loss/∂g (lib/scatter.glsl). One (point, level) per invocation; the level is the launch's slice: only one level's gradients need to fit
+// the cache.
 #include "lib/prelude.glsl"
 #include "lib/hash_grid.glsl"
 #include "lib/scatter.glsl"

@@ -6,18 +6,18 @@
 //     gate = [min_i sdf_i < 0] and, where need_opaque, [sum_i w_i > 0.999]; closed on rays outside the region
 // One subgroup per ray, its lanes share the samples; any subgroup size and any number of groups is right, rays are strided over.
 layout(push_constant, scalar) uniform Args {
-    F32s weights;       // [n, n_samples]
-    F32s sdf;           // [n * n_samples] at bin starts
-    F32s edges;         // [n, n_samples + 1]
-    F32s near_far;      // [2, n]
-    U32s ray_outside;   // [n]
-    F32s origins;       // [3, n]
-    F32s directions;    // [3, n]
-    F32sMut queries;    // [3, 2 n]: P + eps d, then P + offset d
-    F32sMut gate;       // [n] 0 or 1
-    U32sMut heaviest;   // [n] k
-    uint n;
-    uint n_samples;
+    F32s weights;       // [n_rays, n_samples]
+    F32s sdf;           // [n] at bin starts
+    F32s edges;         // [n_rays, n_samples + 1]
+    F32s near_far;      // [2, n_rays]
+    U32s ray_outside;   // [n_rays]
+    F32s origins;       // [3, n_rays]
+    F32s directions;    // [3, n_rays]
+    F32sMut queries;    // [3, 2 n_rays]: P + eps d, then P + offset d
+    F32sMut gate;       // [n_rays] 0 or 1
+    U32sMut heaviest;   // [n_rays] k
+    uint n_rays;
+    uint n_samples; // n = n_rays n_samples
     float eps;          // region units
     float offset;       // region units
     uint need_opaque;   // 1: with a background the ray must be opaque
@@ -28,7 +28,7 @@ const float OPAQUE = 0.999;
 void main() {
     uint n_groups = gl_NumWorkGroups.x * gl_NumWorkGroups.y;
     uint lane = gl_SubgroupInvocationID;
-    for (uint ray = group() * gl_NumSubgroups + gl_SubgroupID; ray < n; ray += n_groups * gl_NumSubgroups) {
+    for (uint ray = group() * gl_NumSubgroups + gl_SubgroupID; ray < n_rays; ray += n_groups * gl_NumSubgroups) {
         uint row = ray * n_samples;
         float best = -1.0, lowest = 1e30, sum = 0.0;
         uint best_index = n_samples - 1u;
@@ -51,13 +51,11 @@ void main() {
             gate.at[ray] = open ? 1.0 : 0.0;
             heaviest.at[ray] = k;
             uint edge = row + ray + k;
-            float t = bin_midpoint(ray_span(near_far, n, ray), edges.at[edge], edges.at[edge + 1u]);
-            [[unroll]] for (uint axis = 0u; axis < 3u; axis++) {
-                float d = directions.at[axis * n + ray];
-                float middle = origins.at[axis * n + ray] + t * d;
-                queries.at[axis * 2u * n + ray] = middle + eps * d;
-                queries.at[axis * 2u * n + n + ray] = middle + offset * d;
-            }
+            float t = bin_midpoint(ray_span(near_far, n_rays, ray), edges.at[edge], edges.at[edge + 1u]);
+            vec3 d = vector_at(directions, ray, n_rays);
+            vec3 middle = vector_at(origins, ray, n_rays) + t * d;
+            set_vector(queries, ray, 2u * n_rays, middle + eps * d);
+            set_vector(queries, n_rays + ray, 2u * n_rays, middle + offset * d);
         }
     }
 }

@@ -10,27 +10,27 @@
 //     D_m = d_what_m - d_what_{m+1} + e^-tau_{m+1} D_{m+1}, from d_what_P = D_P = 0,  d_tau_m = T_{m+1} D_m
 // and through the truncated exponential: d_raw_m = d_tau_m length_m exp(clamp(raw_m, -15, 15)).
 layout(push_constant, scalar) uniform Args {
-    F32s final_edges;      // [n, n_final + 1]
-    F32s final_weights;    // [n, n_final]
-    F32s edges;            // [n, n_samples + 1] of the proposal level
-    F32s weights;          // [n, n_samples] what, of the proposal level
-    F32s raw;              // [n * n_samples] the proposal network's output
-    F32s near_far;         // [2, n]
-    F32sMut loss;          // [n] before scale
-    F32sMut d_raw;         // [n * n_samples] after scale, overwritten
-    F32sMut transmittance; // [n * n_samples] scratch
-    uint n;
+    F32s final_edges;      // [n_rays, n_final + 1]
+    F32s final_weights;    // [n_rays, n_final]
+    F32s edges;            // [n_rays, n_samples + 1] of the proposal level
+    F32s weights;          // [n_rays, n_samples] what, of the proposal level
+    F32s raw;              // [n] the proposal network's output
+    F32s near_far;         // [2, n_rays]
+    F32sMut loss;          // [n_rays] before scale
+    F32sMut d_raw;         // [n] after scale, overwritten
+    F32sMut transmittance; // [n] scratch
+    uint n_rays;
     uint n_final;
-    uint n_samples;
+    uint n_samples; // n = n_rays n_samples
     float scale; // the loss's weight / number of rays
 };
 
 void main() {
     uint ray = item();
-    if (ray >= n) return;
+    if (ray >= n_rays) return;
     uint row = ray * n_samples, edge_row = row + ray;
     uint final_row = ray * n_final, final_edge_row = final_row + ray;
-    Span span = ray_span(near_far, n, ray);
+    Span span = ray_span(near_far, n_rays, ray);
 
     // Transmittance after every bin; d_raw starts as the gradient of the weights, zero.
     float tau_sum = 0.0;

@@ -17,5 +17,5 @@ void main() {
     if (i >= n) return;
     uint index = first + i;
     vec3 cell = vec3(float(index % n_x), float(index / n_x % n_y), float(index / n_x / n_y));
-    [[unroll]] for (uint c = 0u; c < 3u; ++c) points.at[c * n + i] = fma(cell[c], step, origin[c]);
+    set_vector(points, i, n, fma(cell, vec3(step), origin));
 }

@@ -4,22 +4,21 @@
 // Where proposals are asked: the middle of every bin (in distance), one invocation per bin.
 //     m_i = o + (t_i + t_{i+1})/2 d
 layout(push_constant, scalar) uniform Args {
-    F32s origins;    // [3, n]
-    F32s directions; // [3, n]
-    F32s near_far;   // [2, n]
-    F32s edges;      // [n, n_samples + 1]
-    F32sMut points;  // [3, n * n_samples]
-    uint n;
-    uint n_samples;
+    F32s origins;    // [3, n_rays]
+    F32s directions; // [3, n_rays]
+    F32s near_far;   // [2, n_rays]
+    F32s edges;      // [n_rays, n_samples + 1]
+    F32sMut points;  // [3, n]
+    uint n_rays;
+    uint n_samples; // n = n_rays n_samples
 };
 
 void main() {
     uint index = item();
-    uint count = n * n_samples;
-    if (index >= count) return;
+    uint n = n_rays * n_samples;
+    if (index >= n) return;
     uint ray = index / n_samples;
     uint edge = index + ray; // edges have one more per ray than bins
-    float t = bin_midpoint(ray_span(near_far, n, ray), edges.at[edge], edges.at[edge + 1u]);
-    [[unroll]] for (uint axis = 0u; axis < 3u; axis++)
-        points.at[axis * count + index] = origins.at[axis * n + ray] + t * directions.at[axis * n + ray];
+    float t = bin_midpoint(ray_span(near_far, n_rays, ray), edges.at[edge], edges.at[edge + 1u]);
+    set_vector(points, index, n, vector_at(origins, ray, n_rays) + t * vector_at(directions, ray, n_rays));
 }

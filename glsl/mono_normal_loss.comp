@@ -7,29 +7,28 @@
 // MonoSDF):  loss = sum_j |n_j - p_j| + 1 - n.p,  n the rendered sum of w n at unit length, p the prior
 layout(push_constant, scalar) uniform Args {
     Views views;
-    U32s ray_view;    // [n]
-    F32s normals;     // [3, n] of normal_map, region frame
-    F32s priors;      // [6, n] of draw_priors
-    F32s target;      // [4, n]
-    U32s ray_outside; // [n]
-    F32sMut loss;     // [n] before scale
-    F32sMut d_image;  // [5, n] added to
-    uint n;
+    U32s ray_view;    // [n_rays]
+    F32s normals;     // [3, n_rays] of normal_map, region frame
+    F32s priors;      // [6, n_rays] of draw_priors
+    F32s target;      // [4, n_rays]
+    U32s ray_outside; // [n_rays]
+    F32sMut loss;     // [n_rays] before scale
+    F32sMut d_image;  // [5, n_rays] accumulated
+    uint n_rays;
     float scale; // the loss's weight / number of rays
 };
 
 void main() {
     uint ray = item();
-    if (ray >= n) return;
-    vec3 p;
-    [[unroll]] for (uint axis = 0u; axis < 3u; axis++) p[axis] = priors.at[(PRIOR_MONO_NORMAL + axis) * n + ray];
-    float weight = p != vec3(0.0) ? ray_weight(target, ray_outside, ray, n) : 0.0;
+    if (ray >= n_rays) return;
+    vec3 p = vector_at(priors, PRIOR_MONO_NORMAL * n_rays + ray, n_rays);
+    float weight = p != vec3(0.0) ? ray_weight(target, ray_outside, ray, n_rays) : 0.0;
     float m[12] = views.at[ray_view.at[ray]].region_from_camera;
     mat3 camera_from_region = mat3(m[0], m[1], m[2], m[4], m[5], m[6], m[8], m[9], m[10]); // by columns
-    vec3 rendered = camera_from_region * vector_at(normals, ray, n);
+    vec3 rendered = camera_from_region * vector_at(normals, ray, n_rays);
     vec3 error = normal_of(rendered) - p;
     loss.at[ray] = weight * (abs(error.x) + abs(error.y) + abs(error.z) + 1.0 - dot(normal_of(rendered), p));
     vec3 d_rendered = scale * weight * normal_backward(rendered, sign(error) - p);
     vec3 d_normal = transpose(camera_from_region) * d_rendered;
-    [[unroll]] for (uint axis = 0u; axis < 3u; axis++) d_image.at[(D_NORMAL + axis) * n + ray] += d_normal[axis];
+    set_vector(d_image, D_NORMAL * n_rays + ray, n_rays, vector_at(reading(d_image), D_NORMAL * n_rays + ray, n_rays) + d_normal);
 }

@@ -1,14 +1,14 @@
 #version 460
 // Rendered normals: Σ w n over a ray's samples with n = g/‖g‖ (METHOD 2.6; not normalised again), one ray per invocation.
 #include "lib/prelude.glsl"
-#include "lib/shading.glsl"
+#include "lib/normal.glsl"
 
 layout(push_constant, scalar) uniform Args {
     F32s weights;     // [n_rays, n_samples]
-    F32s shading;     // [rows, n_rays * n_samples]
+    F32s gradient;    // [3, n] g
     F32sMut normals;  // [3, n_rays]
     uint n_rays;
-    uint n_samples;
+    uint n_samples; // n = n_rays n_samples
 };
 
 void main() {
@@ -18,8 +18,7 @@ void main() {
     vec3 sum = vec3(0.0);
     for (uint s = 0u; s < n_samples; ++s) {
         uint p = ray * n_samples + s;
-        vec3 g = vec3(shading.at[ROW_GRADIENT * n + p], shading.at[(ROW_GRADIENT + 1u) * n + p], shading.at[(ROW_GRADIENT + 2u) * n + p]);
-        sum += weights.at[p] / max(length(g), 1e-12) * g;
+        sum += weights.at[p] * normal_of(vector_at(gradient, p, n));
     }
-    [[unroll]] for (uint c = 0u; c < 3u; ++c) normals.at[c * n_rays + ray] = sum[c];
+    set_vector(normals, ray, n_rays, sum);
 }

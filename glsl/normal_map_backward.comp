@@ -6,11 +6,11 @@
 // composite_backward's.
 layout(push_constant, scalar) uniform Args {
     F32s weights;       // [n_rays, n_samples]
-    F32s gradient;      // [3, n_rays * n_samples]
+    F32s gradient;      // [3, n]
     F32s d_image;       // [5, n_rays] the last three planes are the normal's
-    F32sMut d_gradient; // [3, n_rays * n_samples] added to
+    F32sMut d_gradient; // [3, n] accumulated
     uint n_rays;
-    uint n_samples;
+    uint n_samples; // n = n_rays n_samples
 };
 
 void main() {
@@ -18,8 +18,7 @@ void main() {
     uint n = n_rays * n_samples;
     if (p >= n) return;
     uint ray = p / n_samples;
-    vec3 d_normal;
-    [[unroll]] for (uint axis = 0u; axis < 3u; axis++) d_normal[axis] = d_image.at[(D_NORMAL + axis) * n_rays + ray];
+    vec3 d_normal = vector_at(d_image, D_NORMAL * n_rays + ray, n_rays);
     vec3 d_g = normal_backward(vector_at(gradient, p, n), weights.at[p] * d_normal);
-    [[unroll]] for (uint axis = 0u; axis < 3u; axis++) d_gradient.at[axis * n + p] += d_g[axis];
+    set_vector(d_gradient, p, n, vector_at(reading(d_gradient), p, n) + d_g);
 }

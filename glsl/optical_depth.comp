@@ -6,7 +6,7 @@
 #include "lib/optical_depth.glsl"
 
 layout(push_constant, scalar) uniform Args {
-    F32s sdf;         // [n] f, n = n_rays n_samples (the first block of the taps' array)
+    F32s sdf;         // [n] f (the first block of the taps' array)
     F32s gradient;    // [3, n] g; not read for the Laplace density of f
     F32s scale;       // [n] logits of the local scale, or [1]
     F32s directions;  // [3, n_rays] d
@@ -15,7 +15,7 @@ layout(push_constant, scalar) uniform Args {
     U32s ray_outside; // [n_rays] such rays are empty, whatever the network says
     F32sMut optical_depth; // [n] tau
     uint n_rays;
-    uint n_samples;
+    uint n_samples; // n = n_rays n_samples
     float scale_range;  // of the local scale; rate of the exponential one
     float scale_floor;
     float inv_s_lower;  // the scheduled lower bound of the local 1/beta

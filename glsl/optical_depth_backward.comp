@@ -5,7 +5,7 @@
 #include "lib/volume.glsl"
 #include "lib/optical_depth.glsl"
 
-layout(constant_id = 2) const uint GRADIENT = 0;  // 1: there is somebody to hear d_gradient
+layout(constant_id = 2) const uint GRADIENT = 0;  // 1: d_gradient is wanted
 
 layout(push_constant, scalar) uniform Args {
     F32s sdf;         // [n]
@@ -19,7 +19,7 @@ layout(push_constant, scalar) uniform Args {
     F32sMut d_scale;    // [n], also where there is one scale for all: its summands
     F32sMut d_gradient; // [3, n], with GRADIENT; zero for the Laplace density of f
     uint n_rays;
-    uint n_samples;
+    uint n_samples; // n = n_rays n_samples
     float scale_range;
     float scale_floor;
     float inv_s_lower;
@@ -41,8 +41,5 @@ void main() {
     float d_tau = d_sdf.at[p];
     d_sdf.at[p] = d_tau * depth.d_sdf;
     d_scale.at[p] = d_tau * depth.d_inv_s * at.d_parameter;
-    if (GRADIENT != 0u) {
-        [[unroll]] for (uint axis = 0u; axis < 3u; ++axis)
-            d_gradient.at[axis * n + p] = d_tau * depth.d_cosine * directions.at[axis * n_rays + ray];
-    }
+    if (GRADIENT != 0u) set_vector(d_gradient, p, n, d_tau * depth.d_cosine * vector_at(directions, ray, n_rays));
 }

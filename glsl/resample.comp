@@ -8,13 +8,13 @@
 //     u_j = (j + xi) / n_edges with xi = draw (training) or 1/2,  edge_j = c^-1(u_j)               linear inside a bin, right-sided at ties
 // Edges carry no gradient.
 layout(push_constant, scalar) uniform Args {
-    F32s raw;          // [n, n_samples] logarithm of density, the network's output
-    F32s edges;        // [n, n_samples + 1] in [0,1]
-    F32s near_far;     // [2, n]
-    F32s jitter;       // [n] in [0,1), one per ray; read only while training
-    F32sMut weights;   // [n, n_samples] of the proposal, not annealed
-    F32sMut new_edges; // [n, n_new + 1] in [0,1], never decreasing
-    uint n;
+    F32s raw;          // [n_rays, n_samples] logarithm of density, the network's output
+    F32s edges;        // [n_rays, n_samples + 1] in [0,1]
+    F32s near_far;     // [2, n_rays]
+    F32s jitter;       // [n_rays] in [0,1), one per ray; read only while training
+    F32sMut weights;   // [n_rays, n_samples] of the proposal, not annealed
+    F32sMut new_edges; // [n_rays, n_new + 1] in [0,1], never decreasing
+    uint n_rays;
     uint n_samples;
     uint n_new;
     uint train;   // 0: no jitter
@@ -30,12 +30,12 @@ float histogram(float weight) {
 
 void main() {
     uint ray = item();
-    if (ray >= n) return;
+    if (ray >= n_rays) return;
     uint row = ray * n_samples;
     uint edge_row = ray * (n_samples + 1u);
 
     // Weights by quadrature, and the histogram's total.
-    Span span = ray_span(near_far, n, ray);
+    Span span = ray_span(near_far, n_rays, ray);
     float depth = 0.0, transmittance = 1.0, total = 0.0;
     float s0 = edges.at[edge_row];
     for (uint i = 0u; i < n_samples; i++) {

@@ -33,7 +33,7 @@ void main() {
     uint ray = p / (n / n_rays);
     vec3 g = vec3(0.0);
     if (TAPS == 0u) {
-        g = vec3(gradient.at[p], gradient.at[n + p], gradient.at[2u * n + p]);
+        g = vector_at(gradient, p, n);
     } else {
         float delta = tap_step(tap_draws.at[p], tap_range, tap_floor);
         float trace = 0.0;
@@ -42,14 +42,14 @@ void main() {
             g += f * tap_direction(tap);
             trace += f - sdf.at[p];
         }
-        g *= 3.0 / (float(TAPS) * delta);
-        if (CURVATURE != 0u) curvature.at[p] = curvature_scale * abs(trace) * 6.0 / (float(TAPS) * delta * delta);
+        g *= gradient_factor(delta);
+        if (CURVATURE != 0u) curvature.at[p] = curvature_scale * trace_factor(delta) * abs(trace);
     }
     float excess = length(g) - 1.0;
     eikonal.at[p] = excess * excess;
+    set_vector(shading, ROW_GRADIENT * n + p, n, g);
+    set_vector(shading, ROW_POSITION * n + p, n, vector_at(points, p, BLOCKS * n));
     [[unroll]] for (uint c = 0u; c < 3u; ++c) {
-        shading.at[(ROW_GRADIENT + c) * n + p] = g[c];
-        shading.at[(ROW_POSITION + c) * n + p] = points.at[c * BLOCKS * n + p];
         float d = directions.at[c * n_rays + ray];
         [[unroll]] for (uint k = 0u; k < 4u; ++k) {
             float angle = d * float(1u << k);

@@ -1,9 +1,10 @@
 #version 460
 #define LOCAL_SIZE 256
 #include "lib/prelude.glsl"
-// Sums of loss arrays: losses[k] = scale_k * sum of term k's values, losses[n_terms] = the total
-// of those that count. ONE workgroup, fixed order: the same
-// values give the same sums in every run. non_finite is set where a sum is not a number or infinite, and never cleared here.
+#include "lib/scalar.glsl"
+#include "lib/workgroup_sum.glsl"
+// Sums of loss arrays: losses[k] = scale_k * sum of term k's values, losses[n_terms] = the total of those that count. ONE workgroup, fixed
+// order: the same values give the same sums in every run. bad_step is set where the total is not finite, and never cleared here.
 struct LossTerm {
     F32s values; // [count]
     uint count;
@@ -16,11 +17,9 @@ layout(buffer_reference, scalar, buffer_reference_align = 8) readonly buffer Los
 layout(push_constant, scalar) uniform Args {
     LossTerms terms;     // [n_terms]
     F32sMut losses;      // [n_terms + 1]
-    U32sMut non_finite;  // [1] 1 once any sum was not finite
+    U32sMut bad_step;    // [1] 1 once a total was not finite
     uint n_terms;
 };
-
-shared float partial[LOCAL_SIZE];
 
 void main() {
     uint lane = gl_LocalInvocationID.x;
@@ -29,19 +28,12 @@ void main() {
         LossTerm term = terms.at[k];
         float sum = 0.0;
         for (uint i = lane; i < term.count; i += LOCAL_SIZE) sum += term.values.at[i];
-        partial[lane] = sum;
-        barrier();
-        for (uint stride = LOCAL_SIZE / 2u; stride > 0u; stride /= 2u) {
-            if (lane < stride) partial[lane] += partial[lane + stride];
-            barrier();
-        }
-        float loss = term.scale * partial[0];
+        float loss = term.scale * workgroup_sum(sum);
         if (term.counts != 0u) total += loss;
         if (lane == 0u) losses.at[k] = loss;
-        barrier(); // before the next term reuses partial
     }
     if (lane == 0u) {
         losses.at[n_terms] = total;
-        if ((floatBitsToUint(total) & 0x7F800000u) == 0x7F800000u) non_finite.at[0] = 1u;
+        if (!is_finite(total)) bad_step.at[0] = 1u;
     }
 }

@@ -8,32 +8,29 @@
 layout(constant_id = 3) const uint MIDPOINT = 0;
 
 layout(push_constant, scalar) uniform Args {
-    F32s origins;    // [3, n]
-    F32s directions; // [3, n]
-    F32s near_far;   // [2, n]
-    F32s edges;      // [n, n_samples + 1]
-    F32s tap_draws;  // [n * n_samples] u in [0,1); read only where there are taps
-    F32sMut points;  // [3, BLOCKS * n * n_samples]: block 0 the samples, then their taps
-    uint n;
-    uint n_samples;
+    F32s origins;    // [3, n_rays]
+    F32s directions; // [3, n_rays]
+    F32s near_far;   // [2, n_rays]
+    F32s edges;      // [n_rays, n_samples + 1]
+    F32s tap_draws;  // [n] u in [0,1); read only where there are taps
+    F32sMut points;  // [3, BLOCKS * n]: block 0 the samples, then their taps
+    uint n_rays;
+    uint n_samples; // n = n_rays n_samples
     float tap_range; // region units
     float tap_floor; // region units
 };
 
 void main() {
     uint index = item();
-    uint count = n * n_samples;
-    if (index >= count) return;
+    uint n = n_rays * n_samples;
+    if (index >= n) return;
     uint ray = index / n_samples;
-    uint total = BLOCKS * count;
-    Span span = ray_span(near_far, n, ray);
+    uint total = BLOCKS * n;
+    Span span = ray_span(near_far, n_rays, ray);
     float s = edges.at[index + ray]; // edges have one more per ray than bins
     float t = MIDPOINT != 0u ? bin_midpoint(span, s, edges.at[index + ray + 1u]) : distance_at(span, s);
     float delta = TAPS > 0u ? tap_step(tap_draws.at[index], tap_range, tap_floor) : 0.0;
-    [[unroll]] for (uint axis = 0u; axis < 3u; axis++) {
-        float x = origins.at[axis * n + ray] + t * directions.at[axis * n + ray];
-        uint first = axis * total + index;
-        points.at[first] = x;
-        for (uint tap = 0u; tap < TAPS; tap++) points.at[first + (1u + tap) * count] = x + delta * tap_direction(tap)[axis];
-    }
+    vec3 x = vector_at(origins, ray, n_rays) + t * vector_at(directions, ray, n_rays);
+    set_vector(points, index, total, x);
+    for (uint tap = 0u; tap < TAPS; tap++) set_vector(points, (1u + tap) * n + index, total, x + delta * tap_direction(tap));
 }

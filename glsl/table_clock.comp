@@ -8,20 +8,20 @@
 
 layout(constant_id = 0) const uint LEVELS = 12;
 
-layout(buffer_reference, scalar) buffer LagsMut { Lag at[]; };
+layout(buffer_reference, scalar) buffer ClockRowsMut { ClockRow at[]; };
 
 layout(push_constant, scalar) uniform Args {
     Levels levels;
-    U32s bad_step;      // [1] non-zero: there was no update
-    LevelUsesMut uses;  // [LEVELS]
-    LagsMut lags;       // [256]
-    U32sMut clock;      // [1]
-    float rate;         // η / (1 − β₁ᵗ)
-    float decay;        // η λ
-    float correction;   // √(1 − β₂ᵗ)
-    float share1;       // 1 − β₁
-    float share2;       // 1 − β₂
-    float most;         // share of a level's entries
+    U32s bad_step;         // [1] non-zero: there was no update
+    LevelUsesMut uses;     // [LEVELS]
+    ClockRowsMut rows;     // [256]
+    U32sMut clock;         // [1]
+    float rate;            // η / (1 − β₁ᵗ)
+    float decay;           // η λ
+    float correction;      // √(1 − β₂ᵗ)
+    float one_minus_beta1; // 1 − β₁
+    float one_minus_beta2; // 1 − β₂
+    float most;            // share of a level's entries
 };
 
 // Steps after which a level that was mostly touched is marked again, to see whether it still is.
@@ -40,29 +40,22 @@ void main() {
     if (bad) return;
     uint next = (now + 1u) % READINGS;
     if (row == 0u) clock.at[0] = next;
-    Lag lag = lags.at[row];
     if (row == next) {
-        lag.step_rate = rate;
-        lag.step_decay = decay;
-        lag.step_correction = correction;
-    } else {
-        // Who stands at the clock has missed nothing yet.
-        if (row == now) {
-            lag.decay = 0.0;
-            lag.momentum = 0.0;
-            lag.slowing = 0.0;
-            lag.first = 1.0;
-            lag.second = 1.0;
-        }
-        lag.first -= share1 * lag.first;
-        lag.second -= share2 * lag.second;
-        float root = sqrt(lag.second);
-        float kept = lag.momentum - decay * lag.momentum;
-        float added = rate * correction * lag.first / root;
-        float slowed = kept * lag.slowing + added * correction / root;
-        lag.decay += decay - decay * lag.decay;
-        lag.momentum = kept + added;
-        lag.slowing = lag.momentum > 0.0 ? slowed / lag.momentum : 0.0;
+        rows.at[row].rate = rate;
+        rows.at[row].decay = decay;
+        rows.at[row].correction = correction;
+        return;
     }
-    lags.at[row] = lag;
+    Lag lag = NO_LAG; // who stands at the clock has missed nothing yet
+    if (row != now) lag = rows.at[row].lag;
+    lag.first -= one_minus_beta1 * lag.first;
+    lag.second -= one_minus_beta2 * lag.second;
+    float root = sqrt(lag.second);
+    float kept = lag.momentum - decay * lag.momentum;
+    float added = rate * correction * lag.first / root;
+    float slowed = kept * lag.slowing + added * correction / root;
+    lag.decay += decay - decay * lag.decay;
+    lag.momentum = kept + added;
+    lag.slowing = lag.momentum > 0.0 ? slowed / lag.momentum : 0.0;
+    rows.at[row].lag = lag;
 }

@@ -11,15 +11,15 @@ layout(constant_id = 0) const uint FEATURES = 2;
 layout(push_constant, scalar) uniform Args {
     Levels levels;
     LevelUses uses;         // [levels]
-    Lags lags;              // [256]
+    ClockRows rows;         // [256]
     U32s clock;             // [1]
     U32s marks;             // [slots / 32] a bit each
     U32s stamps;            // [slots / 4] a byte each
     F32sMut table;          // [entries, FEATURES]
     F32sMut first_moment;   // [entries, FEATURES]
     F32sMut second_moment;  // [entries, FEATURES]
-    float share1;       // 1 − β₁
-    float share2;       // 1 − β₂
+    float one_minus_beta1;  // 1 − β₁
+    float one_minus_beta2;  // 1 − β₂
     float epsilon;
 };
 
@@ -31,12 +31,12 @@ void main() {
     uint now = clock.at[0];
     uint stamp = stamp_in(stamps.at[slot >> 2u], slot);
     if (stamp == now) return;
-    Moving x = Moving(load_features(reading(table), entry, k), load_features(reading(first_moment), entry, k),
-                      load_features(reading(second_moment), entry, k));
+    AdamState x = AdamState(load_features(reading(table), entry, k), load_features(reading(first_moment), entry, k),
+                            load_features(reading(second_moment), entry, k));
     bool marked = (marks.at[slot >> 5u] >> (slot & 31u) & 1u) != 0u;
-    Lag lag = lags.at[stamp];
+    Lag lag = rows.at[stamp].lag;
     if (!marked) {
-        store_features(table, entry, k, caught_up(x, lag, lags, stamp, now, Rates(0.0, 0.0, 1.0, share1, share2, epsilon)));
+        store_features(table, entry, k, caught_up(x, lag, rows, stamp, now, Rates(0.0, 0.0, 1.0, one_minus_beta1, one_minus_beta2, epsilon)));
     }
     store_features(first_moment, entry, k, lag.first * x.m);
     store_features(second_moment, entry, k, lag.second * x.v);

@@ -11,18 +11,18 @@ layout(constant_id = 1) const uint FEATURES = 2;
 
 layout(push_constant, scalar) uniform Args {
     Levels levels;
-    F32s points;         // [3, n]
-    Lags lags;           // [256]
-    U32s clock;          // [1]
-    U32s stamps;         // [slots / 4] a byte each
-    F32s first_moment;   // [entries, FEATURES]
-    F32s second_moment;  // [entries, FEATURES]
-    LevelUsesMut uses;   // [LEVELS] counted
-    U32sMut marks;       // [slots / 32] a bit each
-    F32sMut table;       // [entries, FEATURES]
+    F32s points;           // [3, n]
+    ClockRows rows;        // [256]
+    U32s clock;            // [1]
+    U32s stamps;           // [slots / 4] a byte each
+    F32s first_moment;     // [entries, FEATURES]
+    F32s second_moment;    // [entries, FEATURES]
+    LevelUsesMut uses;     // [LEVELS] counted
+    U32sMut marks;         // [slots / 32] a bit each
+    F32sMut table;         // [entries, FEATURES]
     uint n;
-    float share1;       // 1 − β₁
-    float share2;       // 1 − β₂
+    float one_minus_beta1; // 1 − β₁
+    float one_minus_beta2; // 1 − β₂
     float epsilon;
 };
 
@@ -31,9 +31,9 @@ void main() {
     uint l = level_of_slice(LEVELS);
     if (point >= n || uses.at[l].whole != 0u) return;
     Level level = levels.at[l];
-    Cell cell = cell_of(level, vec3(points.at[point], points.at[n + point], points.at[2u * n + point]));
+    Cell cell = cell_of(level, vector_at(points, point, n));
     uint now = clock.at[0];
-    Rates rates = Rates(0.0, 0.0, 1.0, share1, share2, epsilon);
+    Rates rates = Rates(0.0, 0.0, 1.0, one_minus_beta1, one_minus_beta2, epsilon);
     uint touched = 0u;
     for (uint corner = 0u; corner < 8u; ++corner) {
         uint entry = corner_entry(level, cell, corner);
@@ -45,11 +45,11 @@ void main() {
         ++touched;
         uint stamp = stamp_in(stamps.at[slot >> 2u], slot);
         if (stamp == now) continue;
-        Lag lag = lags.at[stamp];
+        Lag lag = rows.at[stamp].lag;
         [[unroll]] for (uint k = 0u; k < PAIRS; ++k) {
-            Moving x = Moving(load_features(reading(table), entry, k), load_features(first_moment, entry, k),
-                              load_features(second_moment, entry, k));
-            store_features(table, entry, k, caught_up(x, lag, lags, stamp, now, rates));
+            AdamState x = AdamState(load_features(reading(table), entry, k), load_features(first_moment, entry, k),
+                                    load_features(second_moment, entry, k));
+            store_features(table, entry, k, caught_up(x, lag, rows, stamp, now, rates));
         }
     }
     touched = subgroupAdd(touched);

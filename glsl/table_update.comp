@@ -14,7 +14,7 @@ layout(constant_id = 1) const uint STRIP = 16;  // words of 32 marks: long strip
 layout(push_constant, scalar) uniform Args {
     Levels levels;
     LevelUses uses;         // [levels]
-    Lags lags;              // [256]
+    ClockRows rows;         // [256]
     U32s clock;             // [1]
     U32s bad_step;          // [1] non-zero: losses not finite
     F32sMut table;          // [entries, FEATURES]
@@ -26,8 +26,8 @@ layout(push_constant, scalar) uniform Args {
     float rate;             // η / (1 − β₁ᵗ)
     float decay;            // η λ
     float correction;       // √(1 − β₂ᵗ)
-    float share1;         // 1 − β₁
-    float share2;         // 1 − β₂
+    float one_minus_beta1;  // 1 − β₁
+    float one_minus_beta2;  // 1 − β₂
     float epsilon;
     float most;             // share of a level's entries
     uint step;
@@ -43,12 +43,12 @@ Rates rates;
 void update_stale(uint entry, uint slot, bool marked) {
     uint stamp = stamp_in(stamps.at[slot >> 2u], slot);
     Lag lag = NO_LAG;
-    if (stamp != now) lag = lags.at[stamp];
+    if (stamp != now) lag = rows.at[stamp].lag;
     [[unroll]] for (uint k = 0u; k < PAIRS; ++k) {
-        Moving x = Moving(load_features(reading(table), entry, k), load_features(reading(first_moment), entry, k),
-                          load_features(reading(second_moment), entry, k));
+        AdamState x = AdamState(load_features(reading(table), entry, k), load_features(reading(first_moment), entry, k),
+                                load_features(reading(second_moment), entry, k));
         vec2 g = load_sums(grads, entry, k);
-        if (!marked) x.p = caught_up(x, lag, lags, stamp, now, rates);
+        if (!marked) x.p = caught_up(x, lag, rows, stamp, now, rates);
         x.m *= lag.first;
         x.v *= lag.second;
         if (!bad) x = adam_step(x, g, rates);
@@ -68,7 +68,7 @@ void main() {
     now = clock.at[0];
     bad = bad_step.at[0] != 0u;
     next = bad ? now : (now + 1u) % READINGS;
-    rates = Rates(rate, decay, correction, share1, share2, epsilon);
+    rates = Rates(rate, decay, correction, one_minus_beta1, one_minus_beta2, epsilon);
 
     uint word = item() * STRIP, end = min(word + STRIP, (level.entries + 31u) / 32u);
     bool all = mostly_touched(level, use.touched, most) || item() / 8u % SWEEP == step % SWEEP;

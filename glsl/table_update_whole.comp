@@ -20,8 +20,8 @@ layout(push_constant, scalar) uniform Args {
     float rate;             // η / (1 − β₁ᵗ)
     float decay;            // η λ
     float correction;       // √(1 − β₂ᵗ)
-    float share1;           // 1 − β₁
-    float share2;           // 1 − β₂
+    float one_minus_beta1;  // 1 − β₁
+    float one_minus_beta2;  // 1 − β₂
     float epsilon;
 };
 
@@ -34,7 +34,7 @@ void main() {
     Level level = levels.at[l];
     uint n_params = level.entries * FEATURES, first = group() * LOCAL_SIZE * TURNS + gl_LocalInvocationID.x;
     bool bad = bad_step.at[0] != 0u;
-    Rates rates = Rates(rate, decay, correction, share1, share2, epsilon);
+    Rates rates = Rates(rate, decay, correction, one_minus_beta1, one_minus_beta2, epsilon);
     for (uint turn = 0u; turn < TURNS; turn += AT_ONCE) {
         [[unroll]] for (uint k = 0u; k < AT_ONCE; ++k) {
             uint j = 2u * (first + (turn + k) * LOCAL_SIZE);

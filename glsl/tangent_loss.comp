@@ -27,8 +27,6 @@ void main() {
     loss.at[p] = clamp(angle, SMALLEST, PI - SMALLEST) / PI;
     float d_c = clamped ? 0.0 : -scale / (PI * sine);
     vec3 d_g = normal_backward(g, d_c * normal_beside), d_beside = normal_backward(beside, d_c * normal);
-    [[unroll]] for (uint axis = 0u; axis < 3u; ++axis) {
-        d_gradient.at[axis * n + p] += d_g[axis];
-        d_gradient_beside.at[axis * n + p] = d_beside[axis];
-    }
+    set_vector(d_gradient, p, n, vector_at(reading(d_gradient), p, n) + d_g);
+    set_vector(d_gradient_beside, p, n, d_beside);
 }

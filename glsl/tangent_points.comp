@@ -23,6 +23,5 @@ void main() {
     uint ray = p / (n / n_rays);
     float t = bin_midpoint(ray_span(near_far, n_rays, ray), edges.at[p + ray], edges.at[p + ray + 1u]);
     vec3 beside = TANGENT_STEP * cross(normal_of(vector_at(gradient, p, n)), random_direction(draws, p, n));
-    [[unroll]] for (uint axis = 0u; axis < 3u; ++axis)
-        points.at[axis * n + p] = origins.at[axis * n_rays + ray] + t * directions.at[axis * n_rays + ray] + beside[axis];
+    set_vector(points, p, n, vector_at(origins, ray, n_rays) + t * vector_at(directions, ray, n_rays) + beside);
 }

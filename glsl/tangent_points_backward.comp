@@ -16,5 +16,5 @@ void main() {
     if (p >= n) return;
     vec3 d_n = TANGENT_STEP * cross(random_direction(draws, p, n), vector_at(d_points, p, n));
     vec3 d_g = normal_backward(vector_at(gradient, p, n), d_n);
-    [[unroll]] for (uint axis = 0u; axis < 3u; ++axis) d_gradient.at[axis * n + p] += d_g[axis];
+    set_vector(d_gradient, p, n, vector_at(reading(d_gradient), p, n) + d_g);
 }

@@ -5,39 +5,30 @@
 // Indices past the last pixel repeat the last pixel.
 layout(push_constant, scalar) uniform Args {
     Views views;
-    F32sMut origins;     // [3, n] region frame
-    F32sMut directions;  // [3, n] unit length
-    F32sMut near_far;    // [2, n]
-    U32sMut ray_view;    // [n] all set to appearance_view
-    U32sMut ray_outside; // [n] 1 where the ray misses the region
-    F32sMut target;      // [4, n] red, green, blue, weight; untouched where with_target is 0
-    uint n;
+    F32sMut origins;     // [3, n_rays] region frame
+    F32sMut directions;  // [3, n_rays] unit length
+    F32sMut near_far;    // [2, n_rays]
+    U32sMut ray_view;    // [n_rays] all set to appearance_view
+    U32sMut ray_outside; // [n_rays] 1 where the ray misses the region
+    uint n_rays;
     uint view;            // entry of views
     uint first;           // pixel
     uint appearance_view; // the training view whose appearance code colours these rays
-    uint with_target;     // 0: the view has no pixels, or nobody asks for them
-    uint use_mask;        // 0: every pixel counts
     uint region_shape;    // 0: unit sphere, 1: box
     vec3 half_extents;    // of the box
 };
 
 void main() {
     uint index = item();
-    if (index >= n) return;
+    if (index >= n_rays) return;
     View camera = views.at[view];
     uint number = min(first + index, camera.width * camera.height - 1u);
     uvec2 pixel = uvec2(number % camera.width, number / camera.width);
     Ray ray = pixel_ray(camera, pixel, region_shape, half_extents);
-    [[unroll]] for (uint axis = 0u; axis < 3u; axis++) {
-        origins.at[axis * n + index] = ray.origin[axis];
-        directions.at[axis * n + index] = ray.direction[axis];
-    }
+    set_vector(origins, index, n_rays, ray.origin);
+    set_vector(directions, index, n_rays, ray.direction);
     near_far.at[index] = ray.near;
-    near_far.at[n + index] = ray.far;
+    near_far.at[n_rays + index] = ray.far;
     ray_view.at[index] = appearance_view;
     ray_outside.at[index] = ray.outside;
-    if (with_target != 0u) {
-        vec4 wanted = pixel_target(camera, pixel, use_mask);
-        [[unroll]] for (uint channel = 0u; channel < 4u; channel++) target.at[channel * n + index] = wanted[channel];
-    }
 }

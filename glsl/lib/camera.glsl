@@ -6,8 +6,6 @@
 //   x' = x rho + 2 p1 x y + p2 (s + 2 x^2) + b1 s
 //   y' = y rho + 2 p2 x y + p1 (s + 2 y^2) + b2 s,      pixel = focal w' + centre.
 // FOV has a closed form. src/scene/camera.rs is the same in float64, with the derivation and the parameters' order.
-#ifndef CAMERA_GLSL
-#define CAMERA_GLSL
 
 const uint CAMERA_SIMPLE_PINHOLE = 0u;
 const uint CAMERA_PINHOLE = 1u;
@@ -92,5 +90,3 @@ vec3 camera_direction(uint model, float p[12], vec2 pixel) {
     float angle = min(theta, 3.14159265);
     return vec3(w.x, -w.y, 0.0) * (sin(angle) / theta) + vec3(0.0, 0.0, -cos(angle));
 }
-
-#endif

@@ -38,9 +38,15 @@ Cell cell_of(Level level, vec3 x) {
 
 const uvec3 HASH_PRIMES = uvec3(1u, 2654435761u, 805459861u);
 
-// Entry (within the whole table) of corner 0..7 of a cell; bit 0, 1, 2 of `corner` steps along x, y, z.
+// Corners of a cell are 0..7; bit 0, 1, 2 steps along x, y, z.
+uvec3 corner_step(uint corner) { return uvec3(corner & 1u, (corner >> 1u) & 1u, corner >> 2u); }
+
+// The same as −1 and 1.
+vec3 corner_side(uint corner) { return 2.0 * vec3(corner_step(corner)) - 1.0; }
+
+// Entry (within the whole table) of a corner of a cell.
 uint corner_entry(Level level, Cell cell, uint corner) {
-    uvec3 at = cell.low + uvec3(corner & 1u, (corner >> 1u) & 1u, corner >> 2u);
+    uvec3 at = cell.low + corner_step(corner);
     uint index;
     if (level.hashed != 0u) {
         uvec3 h = at * HASH_PRIMES;
@@ -56,25 +62,25 @@ uint corner_entry(Level level, Cell cell, uint corner) {
     return level.offset + index;
 }
 
+// The trilinear weight of a corner is the product of these.
+vec3 axis_weights(Cell cell, uint corner) { return mix(1.0 - cell.weight, cell.weight, vec3(corner_step(corner))); }
+
 float corner_weight(Cell cell, uint corner) {
-    vec3 far = vec3(float(corner & 1u), float((corner >> 1u) & 1u), float(corner >> 2u));
-    vec3 w = mix(1.0 - cell.weight, cell.weight, far);
+    vec3 w = axis_weights(cell, corner);
     return w.x * w.y * w.z;
 }
 
 // d corner_weight / d x for x in [-1, 1]³. Along its own axis the trilinear weight is linear, so it depends on the other two only.
 vec3 corner_slope(Level level, Cell cell, uint corner) {
-    vec3 far = vec3(float(corner & 1u), float((corner >> 1u) & 1u), float(corner >> 2u));
-    vec3 w = mix(1.0 - cell.weight, cell.weight, far);
-    return 0.5 * level.scale * (2.0 * far - 1.0) * w.yzx * w.zxy;
+    vec3 w = axis_weights(cell, corner), side = corner_side(corner);
+    return 0.5 * level.scale * side * w.yzx * w.zxy;
 }
 
 // (d² corner_weight / d x²) v: only the mixed derivatives are there.
 vec3 corner_curvature(Level level, Cell cell, uint corner, vec3 v) {
-    vec3 far = vec3(float(corner & 1u), float((corner >> 1u) & 1u), float(corner >> 2u));
-    vec3 w = mix(1.0 - cell.weight, cell.weight, far);
-    vec3 sv = (2.0 * far - 1.0) * v;
-    return 0.25 * level.scale * level.scale * (2.0 * far - 1.0) * (sv.yzx * w.zxy + sv.zxy * w.yzx);
+    vec3 w = axis_weights(cell, corner), side = corner_side(corner);
+    vec3 sv = side * v;
+    return 0.25 * level.scale * level.scale * side * (sv.yzx * w.zxy + sv.zxy * w.yzx);
 }
 
 // Whether two corners of a cell may share an entry. A corner's hash differs from corner 0's by the exclusive or of what its steps along

@@ -13,18 +13,24 @@
 
 const uint READINGS = 256u;
 
-// What entries stamped with a row's reading have missed; and the update that ended with this reading.
+// What an entry has missed.
 struct Lag {
     float decay;     // E
     float momentum;  // S
     float slowing;   // b
     float first;     // β₁ᵏ
     float second;    // β₂ᵏ
-    float step_rate;
-    float step_decay;
-    float step_correction;
 };
-layout(buffer_reference, scalar) readonly buffer Lags { Lag at[]; };
+const Lag NO_LAG = Lag(0.0, 0.0, 0.0, 1.0, 1.0);
+
+// Of a reading of the clock: what entries stamped with it have missed by now, and the update that ended with it.
+struct ClockRow {
+    Lag lag;
+    float rate;
+    float decay;
+    float correction;
+};
+layout(buffer_reference, scalar) readonly buffer ClockRows { ClockRow at[]; };
 
 struct LevelUse {
     uint touched;  // entries marked in this step
@@ -41,10 +47,8 @@ bool mostly_touched(Level level, uint touched, float most) { return float(touche
 
 uint stamp_in(uint word, uint slot) { return (word >> (8u * (slot & 3u))) & 255u; }
 
-const Lag NO_LAG = Lag(0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 1.0);
-
-// p of an entry that stands at `stamp`, with its row, as it should be at `now`.
-vec2 caught_up(Moving x, Lag lag, Lags lags, uint stamp, uint now, Rates r) {
+// p of an entry that stands at `stamp`, with its lag, as it should be at `now`.
+vec2 caught_up(AdamState x, Lag lag, ClockRows rows, uint stamp, uint now, Rates r) {
     float slowing = r.epsilon * lag.slowing;
     vec2 inverse = 1.0 / max(sqrt(x.v) + slowing, 1e-37);
     vec2 moved = lag.momentum * x.m * inverse;
@@ -54,8 +58,9 @@ vec2 caught_up(Moving x, Lag lag, Lags lags, uint stamp, uint now, Rates r) {
     vec2 neglected = abs(moved) * small * small;
     if (max(neglected.x, neglected.y) > 2e-7) {
         for (uint k = stamp; k != now; k = (k + 1u) % READINGS) {
-            Lag next = lags.at[(k + 1u) % READINGS];
-            x = adam_step(x, vec2(0.0), Rates(next.step_rate, next.step_decay, next.step_correction, r.share1, r.share2, r.epsilon));
+            ClockRow next = rows.at[(k + 1u) % READINGS];
+            x = adam_step(x, vec2(0.0),
+                          Rates(next.rate, next.decay, next.correction, r.one_minus_beta1, r.one_minus_beta2, r.epsilon));
         }
         return x.p;
     }

@@ -1,10 +1,8 @@
-// Normals of the signed distance, n = g/‖g‖, and what g hears from them.
-
-vec3 vector_at(F32s planes, uint p, uint n) { return vec3(planes.at[p], planes.at[n + p], planes.at[2u * n + p]); }
+// Normals of the signed distance, n = g/‖g‖, and their adjoint.
 
 vec3 normal_of(vec3 g) { return g / max(length(g), 1e-12); }
 
-// What g hears from its normal: (d_n - n (n·d_n)) / ‖g‖.
+// d_g = (d_n - n (n·d_n)) / ‖g‖.
 vec3 normal_backward(vec3 g, vec3 d_n) {
     vec3 n = normal_of(g);
     return (d_n - n * dot(n, d_n)) / max(length(g), 1e-12);

@@ -1,4 +1,5 @@
 // From a signed distance to the optical depth of a bin: the scale, and the densities of the methods (METHOD 2.5, 11), with derivatives.
+#include "lib/scalar.glsl"
 
 layout(constant_id = 0) const uint DENSITY = 0;
 const uint DENSITY_LAPLACE = 0u;  // of the signed distance
@@ -28,11 +29,9 @@ Scale scale_of(float v, float range, float floor_, float lower) {
         float inv_s = 1.0 / (abs(v) + floor_);
         return Scale(inv_s, -inv_s * inv_s * sign(v));
     }
-    float e = exp(-abs(v));
-    float sigmoid = (v >= 0.0 ? 1.0 : e) / (1.0 + e);
-    float inv_s = 1.0 / (range * sigmoid + floor_);
+    float inv_s = 1.0 / (range * sigmoid(v) + floor_);
     if (inv_s < lower) return Scale(lower, 0.0);
-    return Scale(inv_s, -inv_s * inv_s * range * e / ((1.0 + e) * (1.0 + e)));
+    return Scale(inv_s, -inv_s * inv_s * range * sigmoid(v) * sigmoid(-v));
 }
 
 struct BinDepth {
@@ -64,19 +63,14 @@ BinDepth sight_depth(float f, float c, float inv_s, float bin) {
 
 const float NEUS_EPSILON = 1e-5;
 
-float logistic(float x) {
-    float e = exp(-abs(x));
-    return (x >= 0.0 ? 1.0 : e) / (1.0 + e);
-}
-
 // NeuS's opacity alpha = (P - Q) / (P + eps) with P, Q = sigmoid(s (f ± h)) at the bin's ends, h = facing length / 2, as the optical depth
 // -ln(1 - alpha) = ln((P + eps)/(Q + eps)). facing is -c where the ray enters; early in training the softer 1/2 - c/2 (anneal from 0 to 1).
 BinDepth neus_depth(float f, float c, float s, float bin, float anneal) {
     float facing = mix(max(0.5 - 0.5 * c, 0.0), max(-c, 0.0), anneal);
     float d_facing = -mix(c < 1.0 ? 0.5 : 0.0, c < 0.0 ? 1.0 : 0.0, anneal);
     float half_step = 0.5 * facing * bin;
-    float p = logistic(s * (f + half_step)), q = logistic(s * (f - half_step));
-    float not_p = logistic(-s * (f + half_step)), not_q = logistic(-s * (f - half_step));
+    float p = sigmoid(s * (f + half_step)), q = sigmoid(s * (f - half_step));
+    float not_p = sigmoid(-s * (f + half_step)), not_q = sigmoid(-s * (f - half_step));
     float lost = p * not_q * opacity(2.0 * s * half_step);  // P - Q, which as a difference would cancel
     float alpha = lost / (p + NEUS_EPSILON);
     // d ln(P + eps) / d (s f) is P (1 - P)/(P + eps); difference and sum of both ends'.
@@ -97,11 +91,9 @@ BinDepth bin_depth(float f, float c, float inv_s, float bin, float anneal) {
     return laplace_depth(f, inv_s, bin);
 }
 
-// c = g·d of sample p, kept from zero as published: by what is added last, since a sum that begins with it loses it, and 0 comes out of
+// c = g·d of sample p, kept from zero as published: by what is added last, since a sum that began with it would lose it, and 0 comes out of
 // one sample in some ten million. A derivative by 0 would make every parameter NaN, although the loss is finite.
 float cosine(F32s gradient, F32s directions, uint p, uint n, uint ray, uint n_rays) {
-    float sum = 0.0;
-    [[unroll]] for (uint axis = 0u; axis < 3u; ++axis) sum += gradient.at[axis * n + p] * directions.at[axis * n_rays + ray];
-    float c = sum + 1e-8;
+    float c = dot(vector_at(gradient, p, n), vector_at(directions, ray, n_rays)) + 1e-8;
     return c == 0.0 ? 1e-8 : c;
 }

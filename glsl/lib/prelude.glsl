@@ -1,7 +1,7 @@
 // What every kernel begins with: extensions, workgroup size, pointer types, the item that this invocation works on.
 //
-// A kernel's first line is `#version 460`, its second includes this file; `#define LOCAL_SIZE n` between the two changes the workgroup
-// size. Files are included once, however often they are named, so they need no guards.
+// A kernel includes it before all other files; `#define LOCAL_SIZE n` above that changes the workgroup size. Files are included once,
+// however often they are named, so they need no guards.
 
 #extension GL_EXT_buffer_reference2 : require
 #extension GL_EXT_buffer_reference_uvec2 : require
@@ -9,10 +9,7 @@
 #extension GL_EXT_shader_explicit_arithmetic_types_int64 : require
 #extension GL_EXT_control_flow_attributes : require
 #extension GL_KHR_shader_subgroup_basic : require
-#extension GL_KHR_shader_subgroup_vote : require
 #extension GL_KHR_shader_subgroup_arithmetic : require
-#extension GL_KHR_shader_subgroup_ballot : require
-#extension GL_KHR_shader_subgroup_shuffle : require
 #extension GL_EXT_shader_atomic_float : require
 #extension GL_EXT_shader_atomic_int64 : require
 
@@ -44,6 +41,15 @@ F32s from(F32s p, uint i) {
 #else
 F32s from(F32s p, uint i) { return F32s(uint64_t(p) + 4ul * i); }
 #endif
+
+// A vector of [3, n] numbers: its components lie in planes of n.
+vec3 vector_at(F32s planes, uint p, uint n) { return vec3(planes.at[p], planes.at[n + p], planes.at[2u * n + p]); }
+
+void set_vector(F32sMut planes, uint p, uint n, vec3 v) {
+    planes.at[p] = v.x;
+    planes.at[n + p] = v.y;
+    planes.at[2u * n + p] = v.z;
+}
 
 // Two neighbours from an even index on, in one access: software devices make one of each component of a vector.
 #ifdef CORE_ONLY

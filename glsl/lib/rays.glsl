@@ -1,4 +1,4 @@
-// From a pixel of a view to a ray in the region's frame, its near and far distance, and the colour it should have.
+// From a pixel of a view to a ray in the region's frame, its near and far distance.
 #include "lib/camera.glsl"
 
 // One picture and its camera. The region's frame is the world's, shifted and scaled so that the region is the unit sphere or a box in it.
@@ -70,15 +70,9 @@ Ray pixel_ray(View view, uvec2 pixel, uint region_shape, vec3 half_extents) {
     return ray;
 }
 
-// The pixel of a view that ray `index` of `n` was drawn at: column = floor(u_1 width), row = floor(u_2 height).
-uvec2 drawn_pixel(View view, F32s pixel_draws, uint index, uint n) {
+// The pixel of a view that ray `index` of `n_rays` was drawn at: column = floor(u_1 width), row = floor(u_2 height).
+uvec2 drawn_pixel(View view, F32s pixel_draws, uint index, uint n_rays) {
     uvec2 size = uvec2(view.width, view.height);
-    uvec2 pixel = uvec2(vec2(pixel_draws.at[n + index], pixel_draws.at[2u * n + index]) * vec2(size));
+    uvec2 pixel = uvec2(vec2(pixel_draws.at[n_rays + index], pixel_draws.at[2u * n_rays + index]) * vec2(size));
     return min(pixel, size - 1u); // the product may round up to the size
-}
-
-// Colour in [0,1] and weight of a pixel: 1, or 0 where masks are used and leave it out.
-vec4 pixel_target(View view, uvec2 pixel, uint use_mask) {
-    vec4 rgba = unpackUnorm4x8(view.pixels.at[pixel.y * view.width + pixel.x]);
-    return vec4(rgba.rgb, use_mask == 0u || rgba.a >= 0.5 ? 1.0 : 0.0);
 }

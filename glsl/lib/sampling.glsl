@@ -21,10 +21,10 @@ struct Span {
     float extent; // S(far) - S(near)
 };
 
-// near_far is [2, n]: the plane of near distances, then that of far distances.
-Span ray_span(F32s near_far, uint n, uint ray) {
+// near_far is [2, n_rays]: the plane of near distances, then that of far distances.
+Span ray_span(F32s near_far, uint n_rays, uint ray) {
     float near = warped(near_far.at[ray]);
-    return Span(near, warped(near_far.at[n + ray]) - near);
+    return Span(near, warped(near_far.at[n_rays + ray]) - near);
 }
 
 float distance_at(Span span, float s) {

@@ -3,7 +3,7 @@
 
 layout(constant_id = 0) const uint LEVELS = 12;
 layout(constant_id = 1) const uint FEATURES = 2;
-layout(constant_id = 2) const uint SECOND_ORDER = 0;  // the table hears from the field's gradient g = Jᵀ a too
+layout(constant_id = 2) const uint SECOND_ORDER = 0;  // there is a gradient through the field's gradient g = Jᵀ a, too
 
 layout(push_constant, scalar) uniform Args {
     Levels levels;
@@ -32,10 +32,10 @@ bool visit(Level level, uint l, uint point) {
     }
     if (SECOND_ORDER != 0u) {
         [[unroll]] for (uint f = 0u; f < FEATURES; ++f) a[f] = slopes.at[(l * FEATURES + f) * n + point];
-        v = vec3(d_gradient.at[point], d_gradient.at[n + point], d_gradient.at[2u * n + point]);
+        v = vector_at(d_gradient, point, n);
         adds = adds || v != vec3(0.0);
     }
-    cell = cell_of(level, vec3(points.at[point], points.at[n + point], points.at[2u * n + point]));
+    cell = cell_of(level, vector_at(points, point, n));
     return adds;
 }
 

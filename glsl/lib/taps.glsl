@@ -15,6 +15,11 @@ vec3 tap_direction(uint tap) {
     return vec3(tap / 2u == 0u ? side : 0.0, tap / 2u == 1u ? side : 0.0, tap / 2u == 2u ? side : 0.0);
 }
 
+// What stands before the two sums.
+float gradient_factor(float delta) { return 3.0 / (float(TAPS) * delta); }
+
+float trace_factor(float delta) { return 6.0 / (float(TAPS) * delta * delta); }
+
 // How far they lie from their sample: U(0, range), not below the floor (Wang et al. 2024, NeuRodin).
 float tap_step(float u, float range, float floor_) {
     return max(range * u, floor_);

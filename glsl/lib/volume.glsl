@@ -17,9 +17,20 @@ float proposal_density_slope(float raw) {
     return exp(clamp(raw, -15.0, 15.0));
 }
 
+// Density of the background's field, exp of its output. e^15 is opaque at any bin length, and sums of optical depth stay finite over bins
+// of hundreds of units.
+float background_density(float raw) {
+    return exp(min(raw, 15.0));
+}
+
+// d density / d raw: none where the bound acts.
+float background_density_slope(float raw) {
+    return raw > 15.0 ? 0.0 : exp(raw);
+}
+
 // The network's colour in (0,1) is stretched a little so that black and white can be reached (Barron et al. 2021, Mip-NeRF).
 const float RGB_PADDING = 0.001;
 
-float padded_rgb(float rgb) {
+vec3 padded_rgb(vec3 rgb) {
     return (1.0 + 2.0 * RGB_PADDING) * rgb - RGB_PADDING;
 }

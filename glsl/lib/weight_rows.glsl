@@ -9,7 +9,7 @@ struct WeightRow {
 };
 layout(buffer_reference, scalar) readonly buffer WeightRows { WeightRow at[]; };
 
-// The columns that act: a level that is switched off has no effect, and hears nothing.
+// The columns that act: a level that is switched off has no effect, and no gradient.
 uint acting_columns(WeightRow row, uint released_columns) {
     return row.released != 0u ? min(row.columns, released_columns) : row.columns;
 }

@@ -349,10 +349,7 @@ impl Instance {
         );
         let operations = [
             (vk::SubgroupFeatureFlags::BASIC, "basic subgroup operations"),
-            (vk::SubgroupFeatureFlags::VOTE, "subgroup votes"),
             (vk::SubgroupFeatureFlags::ARITHMETIC, "subgroup arithmetic"),
-            (vk::SubgroupFeatureFlags::BALLOT, "subgroup ballots"),
-            (vk::SubgroupFeatureFlags::SHUFFLE, "subgroup shuffles"),
         ];
         for (operation, what) in operations {
             need(subgroups.supported_operations.contains(operation), what);

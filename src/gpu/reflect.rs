@@ -10,12 +10,8 @@ use std::collections::{BTreeMap, HashMap, HashSet};
 #[derive(Clone, Debug, PartialEq)]
 pub enum Type {
     F32,
-    F16,
     U32,
     I32,
-    U16,
-    U8,
-    U64,
     Vector(Box<Type>, u32),
     Array(Box<Type>, u32),
     Struct(String),
@@ -326,7 +322,6 @@ impl Words {
             .ok_or(format!("{place}: unknown type"))?;
         Ok(match *raw {
             Raw::Float { width: 32 } => Type::F32,
-            Raw::Float { width: 16 } => Type::F16,
             Raw::Int {
                 width: 32,
                 signed: false,
@@ -335,18 +330,6 @@ impl Words {
                 width: 32,
                 signed: true,
             } => Type::I32,
-            Raw::Int {
-                width: 16,
-                signed: false,
-            } => Type::U16,
-            Raw::Int {
-                width: 8,
-                signed: false,
-            } => Type::U8,
-            Raw::Int {
-                width: 64,
-                signed: false,
-            } => Type::U64,
             Raw::Vector { element, count } => {
                 Type::Vector(Box::new(self.shared_type(element, place, structs)?), count)
             }
@@ -440,9 +423,7 @@ impl Type {
     pub fn size(&self) -> Option<u32> {
         Some(match self {
             Type::F32 | Type::U32 | Type::I32 => 4,
-            Type::F16 | Type::U16 => 2,
-            Type::U8 => 1,
-            Type::U64 | Type::Pointer { .. } => 8,
+            Type::Pointer { .. } => 8,
             Type::Vector(element, count) | Type::Array(element, count) => element.size()? * count,
             Type::Struct(_) => return None,
         })

@@ -405,7 +405,6 @@ impl Radiance {
             edges: r.edges.ptr(),
             raw: r.raw.ptr(),
             rgb: r.rgb.ptr(),
-            color: b.color.ptr(),
             d_color: b.d_color.ptr(),
             d_raw: r.d_raw.ptr_mut(),
             d_rgb: r.d_rgb.ptr_mut(),

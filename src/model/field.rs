@@ -486,7 +486,7 @@ impl Field {
     }
 
     /// Adds all parameter gradients, from `d_first [n]`, for the leading points the heads' gradients in `buffers.hidden`, and for a field
-    /// with a gradient `d_gradient` of its buffers. What such a field's points hear goes into `d_points [3, n]` where that is asked for.
+    /// with a gradient `d_gradient` of its buffers. Those of such a field's points go into `d_points [3, n]` where they are asked for.
     #[allow(clippy::too_many_arguments)] // what a pass over the points needs; a struct would only rename them
     pub fn backward(
         &self,
@@ -650,7 +650,7 @@ impl Field {
         }
     }
 
-    /// What the points hear.
+    /// Gradients of the points.
     fn point_backward(&self, rec: &mut Recorder, pass: &Pass, d_points: PtrMut<f32>) {
         let slope = pass.buffers.slope();
         let args = field_point_backward::Args {

@@ -9,7 +9,8 @@ use crate::Result;
 use crate::config::OptimizerConfig;
 use crate::gpu::{Buffer, Gpu, Kernel, Ptr, Recorder, Work};
 use crate::kernels::{
-    Lag, Level, LevelUse, table_clock, table_flush, table_touch, table_update, table_update_whole,
+    ClockRow, Level, LevelUse, table_clock, table_flush, table_touch, table_update,
+    table_update_whole,
 };
 
 /// What one update is made of, beside gradients and moments: the factors of AdamW at its own step.
@@ -38,12 +39,11 @@ pub struct LazyTable {
     /// Element offsets in the parameter block: of the table, and of the first of these levels.
     table: u64,
     first: u64,
-    /// 1 − β₁ and 1 − β₂.
-    share1: f32,
-    share2: f32,
+    one_minus_beta1: f32,
+    one_minus_beta2: f32,
     epsilon: f32,
     clock: Buffer<u32>,     // [1]
-    lags: Buffer<Lag>,      // [256]
+    rows: Buffer<ClockRow>, // [256]
     uses: Buffer<LevelUse>, // [levels]
     marks: Buffer<u32>,     // [slots / 32]
     stamps: Buffer<u32>,    // [slots / 4]
@@ -113,11 +113,11 @@ impl LazyTable {
             most,
             table,
             first: table + u64::from(first.offset) * u64::from(features),
-            share1: (1.0 - optimizer.beta1) as f32,
-            share2: (1.0 - optimizer.beta2) as f32,
+            one_minus_beta1: (1.0 - optimizer.beta1) as f32,
+            one_minus_beta2: (1.0 - optimizer.beta2) as f32,
             epsilon: optimizer.epsilon as f32,
             clock: gpu.buffer("table clock", 1)?,
-            lags: gpu.buffer("table lags", READINGS)?,
+            rows: gpu.buffer("table clock rows", READINGS)?,
             uses: gpu.buffer("table uses", u64::from(n_levels))?,
             marks: gpu.buffer("table marks", slots / WORD)?,
             stamps: gpu.buffer("table stamps", slots / 4)?,
@@ -143,7 +143,7 @@ impl LazyTable {
         let args = table_touch::Args {
             levels: self.levels.ptr(),
             points,
-            lags: self.lags.ptr(),
+            rows: self.rows.ptr(),
             clock: self.clock.ptr(),
             stamps: self.stamps.ptr(),
             first_moment: params.first_moment().at(self.table),
@@ -152,8 +152,8 @@ impl LazyTable {
             marks: self.marks.ptr_mut(),
             table: params.values().at_mut(self.table),
             n,
-            share1: self.share1,
-            share2: self.share2,
+            one_minus_beta1: self.one_minus_beta1,
+            one_minus_beta2: self.one_minus_beta2,
             epsilon: self.epsilon,
         };
         let work = Work::items(u64::from(n)).slices(self.n_levels);
@@ -182,7 +182,7 @@ impl LazyTable {
         let args = table_update::Args {
             levels: self.levels.ptr(),
             uses: self.uses.ptr(),
-            lags: self.lags.ptr(),
+            rows: self.rows.ptr(),
             clock: self.clock.ptr(),
             bad_step: bad_step.ptr(),
             table: params.values().at_mut(self.table),
@@ -194,8 +194,8 @@ impl LazyTable {
             rate,
             decay,
             correction,
-            share1: self.share1,
-            share2: self.share2,
+            one_minus_beta1: self.one_minus_beta1,
+            one_minus_beta2: self.one_minus_beta2,
             epsilon: self.epsilon,
             most: self.most,
             step: step as u32,
@@ -222,8 +222,8 @@ impl LazyTable {
             rate,
             decay,
             correction,
-            share1: self.share1,
-            share2: self.share2,
+            one_minus_beta1: self.one_minus_beta1,
+            one_minus_beta2: self.one_minus_beta2,
             epsilon: self.epsilon,
         };
         let groups = (self.most_entries * u64::from(self.features)).div_ceil(self.of_group);
@@ -238,13 +238,13 @@ impl LazyTable {
             levels: self.levels.ptr(),
             bad_step: bad_step.ptr(),
             uses: self.uses.ptr_mut(),
-            lags: self.lags.ptr_mut(),
+            rows: self.rows.ptr_mut(),
             clock: self.clock.ptr_mut(),
             rate,
             decay,
             correction,
-            share1: self.share1,
-            share2: self.share2,
+            one_minus_beta1: self.one_minus_beta1,
+            one_minus_beta2: self.one_minus_beta2,
             most: self.most,
         };
         rec.run(&self.tick, Work::groups(1), args);
@@ -256,15 +256,15 @@ impl LazyTable {
         let args = table_flush::Args {
             levels: self.levels.ptr(),
             uses: self.uses.ptr(),
-            lags: self.lags.ptr(),
+            rows: self.rows.ptr(),
             clock: self.clock.ptr(),
             marks: self.marks.ptr(),
             stamps: self.stamps.ptr(),
             table: params.values().at_mut(self.table),
             first_moment: params.first_moment().at_mut(self.table),
             second_moment: params.second_moment().at_mut(self.table),
-            share1: self.share1,
-            share2: self.share2,
+            one_minus_beta1: self.one_minus_beta1,
+            one_minus_beta2: self.one_minus_beta2,
             epsilon: self.epsilon,
         };
         let pairs = u64::from(self.features.div_ceil(2));
@@ -276,7 +276,7 @@ impl LazyTable {
     /// Forgets what entries have missed: values and moments stand as they are meant to be.
     pub fn reset(&self, rec: &mut Recorder) {
         rec.fill(&self.clock, 0..self.clock.len(), 0);
-        rec.fill(&self.lags, 0..self.lags.len(), 0);
+        rec.fill(&self.rows, 0..self.rows.len(), 0);
         rec.fill(&self.uses, 0..self.uses.len(), 0);
         rec.fill(&self.marks, 0..self.marks.len(), 0);
         rec.fill(&self.stamps, 0..self.stamps.len(), 0);

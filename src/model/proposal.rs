@@ -16,12 +16,12 @@ pub struct Proposal {
 /// A proposal level's samples for a batch of rays.
 pub struct ProposalBuffers {
     pub field: FieldBuffers,
-    pub edges: Buffer<f32>,      // [n_rays, n_samples + 1] normalised s
-    pub points: Buffer<f32>,     // [3, n] bin midpoints
-    pub raw: Buffer<f32>,        // [n] log density
-    pub d_raw: Buffer<f32>,      // [n]
-    pub weights: Buffer<f32>,    // [n_rays, n_samples]
-    pub cumulative: Buffer<f32>, // [n_rays, n_samples + 1] scratch of resampling and of the interlevel loss
+    pub edges: Buffer<f32>,         // [n_rays, n_samples + 1] normalised s
+    pub points: Buffer<f32>,        // [3, n] bin midpoints
+    pub raw: Buffer<f32>,           // [n] log density
+    pub d_raw: Buffer<f32>,         // [n]
+    pub weights: Buffer<f32>,       // [n_rays, n_samples]
+    pub transmittance: Buffer<f32>, // [n] scratch of the interlevel loss
 }
 
 impl Proposal {
@@ -93,15 +93,17 @@ impl Proposal {
     pub fn buffers(&self, gpu: &Gpu, level: usize, n_rays: u32) -> Result<ProposalBuffers> {
         let n = n_rays * self.n_samples;
         let name = |what: &str| format!("proposal {level} {what}");
-        let with_borders = u64::from(n_rays) * u64::from(self.n_samples + 1);
         Ok(ProposalBuffers {
             field: FieldBuffers::new(gpu, &format!("proposal {level}"), &self.field.shape, n, 0)?,
-            edges: gpu.scratch(&name("edges"), with_borders)?,
+            edges: gpu.scratch(
+                &name("edges"),
+                u64::from(n_rays) * u64::from(self.n_samples + 1),
+            )?,
             points: gpu.scratch(&name("points"), 3 * u64::from(n))?,
             raw: gpu.scratch(&name("raw"), u64::from(n))?,
             d_raw: gpu.scratch(&name("d_raw"), u64::from(n))?,
             weights: gpu.scratch(&name("weights"), u64::from(n))?,
-            cumulative: gpu.scratch(&name("cumulative"), with_borders)?,
+            transmittance: gpu.scratch(&name("transmittance"), u64::from(n))?,
         })
     }
 

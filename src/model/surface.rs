@@ -33,7 +33,7 @@ pub struct Surface {
     global_scale: Option<u64>,
     /// Points around a sample; 0 where the gradient is analytic.
     taps: u32,
-    gradient_is_heard: bool,
+    gradient_has_other_uses: bool,
 }
 
 /// Activations of the surface at `n` samples and at the taps around each: 1, 5 or 7 blocks of points.
@@ -50,7 +50,7 @@ pub struct SurfaceBuffers {
     pub d_rgb: Buffer<f32>,       // [3, n]
     pub eikonal: Buffer<f32>,     // [n]
     pub curvature: Buffer<f32>,   // [n] weighted, where there is a curvature loss
-    /// What the taps' gradient hears from the density, where that reads it.
+    /// ∂loss/∂g of a gradient by taps, through its other uses, where it has any.
     tap_d_gradient: Option<Buffer<f32>>, // [3, n]
 }
 
@@ -205,7 +205,7 @@ impl Surface {
         };
         let taps = Self::blocks_of(config) - 1;
         let curvature = u32::from(config.loss.curvature.weight > 0.0);
-        let gradient_is_heard = Self::gradient_is_heard(config);
+        let gradient_has_other_uses = Self::gradient_has_other_uses(config);
         Ok(Surface {
             field: Field::new(gpu, "surface", shape, table, hidden_weight, heads_weight)?,
             probes: Field::new(
@@ -243,14 +243,14 @@ impl Surface {
                 appearance: appearance_dims,
                 taps,
                 curvature,
-                heard: u32::from(gradient_is_heard),
+                other_uses: u32::from(gradient_has_other_uses),
             })?,
             sigmoid_backward: gpu.kernel(sigmoid_backward::Shape::default())?,
             appearance_backward: gpu.kernel(appearance_backward::Shape::default())?,
             global_scale_backward: gpu.kernel(global_scale_backward::Shape::default())?,
             global_scale,
             taps,
-            gradient_is_heard,
+            gradient_has_other_uses,
         })
     }
 
@@ -327,7 +327,7 @@ impl Surface {
             d_rgb: gpu.scratch("d_rgb", 3 * n64)?,
             eikonal: gpu.scratch("eikonal", n64)?,
             curvature: gpu.scratch("curvature", n64)?,
-            tap_d_gradient: match self.taps > 0 && self.gradient_is_heard {
+            tap_d_gradient: match self.taps > 0 && self.gradient_has_other_uses {
                 true => Some(gpu.scratch("tap d_gradient", 3 * n64)?),
                 false => None,
             },
@@ -498,9 +498,9 @@ impl Surface {
         b.d_shading.ptr_mut()
     }
 
-    /// Whether the SDF's gradient hears from elsewhere than shading: an analytic one may hear from other losses, any from a density that
-    /// is a function of it and from a loss on rendered normals.
-    pub fn gradient_is_heard(config: &Config) -> bool {
+    /// Whether more than shading and the eikonal loss uses the SDF's gradient: with an analytic one other losses may, with any a density
+    /// that is a function of it and a loss on rendered normals.
+    pub fn gradient_has_other_uses(config: &Config) -> bool {
         config.surface.gradient == GradientKind::Analytic
             || config.surface.density != DensityKind::Laplace
             || config.loss.mono_normal > 0.0
@@ -511,7 +511,7 @@ impl Surface {
         b.shading.ptr().offset(self.gradient_row(b))
     }
 
-    /// Where what the gradient hears from elsewhere than shading is to be written, `[3, n]`; nowhere if nothing else does.
+    /// Where ∂loss/∂g of the SDF's gradient through its other uses is to be written, `[3, n]`; nowhere if it has none.
     pub fn d_gradient(&self, b: &SurfaceBuffers) -> PtrMut<f32> {
         match (&b.tap_d_gradient, self.field.shape.gradient) {
             (Some(of_taps), _) => of_taps.ptr_mut(),

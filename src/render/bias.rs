@@ -134,7 +134,7 @@ pub fn on_plane(gpu: &Gpu, density: DensityKind, cosines: &[f64]) -> Result<Vec<
             background: background.ptr(),
             weights: weights.ptr_mut(),
             image: image.ptr_mut(),
-            n: n as u32,
+            n_rays: n as u32,
             n_samples: BINS as u32,
         };
         rec.run(&composite, Work::items(n as u64), args);

@@ -20,7 +20,7 @@ pub struct Composite {
     forward: Kernel<composite_forward::Args>,
     backward: Kernel<composite_backward::Args>,
     normal_map: Kernel<normal_map::Args>,
-    /// Where a loss hears of normals.
+    /// Where there is a loss on normals.
     normal_map_backward: Option<Kernel<normal_map_backward::Args>>,
     optical_depth: Buffer<f32>, // [n_rays, n_samples]
     optical_depth_forward: Kernel<optical_depth::Args>,
@@ -42,10 +42,6 @@ impl Composite {
     /// Buffers and kernels for a batch of rays.
     pub fn new(gpu: &Gpu, config: &Config, n_rays: u32) -> Result<Composite> {
         let (n, samples) = (u64::from(n_rays), u64::from(config.sampling.samples));
-        let shading = normal_map::Shape {
-            geometry: config.surface.features,
-            appearance: config.appearance.dims,
-        };
         let density = density_of(config.surface.density);
         let scale = scale_of(config.surface.scale);
         Ok(Composite {
@@ -56,7 +52,7 @@ impl Composite {
             backward: gpu.kernel(composite_backward::Shape {
                 supervised: u32::from(config.loss.is_supervised()),
             })?,
-            normal_map: gpu.kernel(shading)?,
+            normal_map: gpu.kernel(normal_map::Shape::default())?,
             normal_map_backward: match config.loss.mono_normal > 0.0 {
                 true => Some(gpu.kernel(normal_map_backward::Shape::default())?),
                 false => None,
@@ -66,7 +62,7 @@ impl Composite {
             optical_depth_backward: gpu.kernel(optical_depth_backward::Shape {
                 density,
                 scale,
-                gradient: u32::from(Surface::gradient_is_heard(config)),
+                gradient: u32::from(Surface::gradient_has_other_uses(config)),
             })?,
             scale_range: match config.surface.scale {
                 ScaleKind::Exponential => config.surface.scale_rate,
@@ -105,14 +101,14 @@ impl Composite {
             background: look.background.color.ptr(),
             weights: self.weights.ptr_mut(),
             image: self.image.ptr_mut(),
-            n,
+            n_rays: n,
             n_samples,
         };
         rec.run(&self.forward, per_ray(n, n_samples), args);
     }
 
     /// Gradients of SDF (block 0), scale, colour and background, and where density or rendered normals read it, of the SDF's gradient,
-    /// from `d_color [3, n_rays]` and, where there are such losses, what else a picture hears: `d_image [5, n_rays]`.
+    /// from `d_color [3, n_rays]` and, where there are losses on more than colour, `d_image [5, n_rays]`.
     pub fn backward(
         &self,
         rec: &mut Recorder,
@@ -137,7 +133,7 @@ impl Composite {
             d_optical_depth: surface.d_sdf.ptr_mut(),
             d_rgb: surface.d_rgb.ptr_mut(),
             d_background: look.background.d_color.ptr_mut(),
-            n,
+            n_rays: n,
             n_samples,
         };
         rec.run(&self.backward, per_ray(n, 2 * n_samples), args);
@@ -175,10 +171,10 @@ impl Composite {
     }
 
     /// Rendered normals, into `self.normals`.
-    pub fn normal_map(&self, rec: &mut Recorder, look: &Look) {
+    pub fn normal_map(&self, rec: &mut Recorder, look: &Look, model: &Model) {
         let args = normal_map::Args {
             weights: self.weights.ptr(),
-            shading: look.surface.shading.ptr(),
+            gradient: model.surface.gradient(look.surface),
             normals: self.normals.ptr_mut(),
             n_rays: look.rays.n,
             n_samples: look.sampler.n_samples,

@@ -121,7 +121,7 @@ impl Loss {
             loss: self.color.ptr_mut(),
             square: self.square.ptr_mut(),
             d_color: self.d_color.ptr_mut(),
-            n: self.n_rays,
+            n_rays: self.n_rays,
             scale: 1.0 / self.n_rays as f32,
         };
         rec.run(
@@ -144,7 +144,7 @@ impl Loss {
             queries: self.queries.ptr_mut(),
             gate: self.gate.ptr_mut(),
             heaviest: self.heaviest.ptr_mut(),
-            n: self.n_rays,
+            n_rays: self.n_rays,
             n_samples: self.n_samples,
             eps: self.epsilon,
             offset: self.offset,
@@ -177,7 +177,7 @@ impl Loss {
             gate: self.gate.ptr(),
             loss: self.bias.ptr_mut(),
             d_query_sdf: self.d_query_sdf.ptr_mut(),
-            n: self.n_rays,
+            n_rays: self.n_rays,
             eps: self.epsilon,
             scale: weight / self.n_rays as f32,
             published: self.published,
@@ -254,7 +254,7 @@ impl Loss {
         let args = sum_losses::Args {
             terms: self.terms.ptr(),
             losses: self.sums.ptr_mut(),
-            non_finite: self.bad_step.ptr_mut(),
+            bad_step: self.bad_step.ptr_mut(),
             n_terms: TERMS.len() as u32,
         };
         rec.run(

@@ -88,7 +88,7 @@ impl Priors {
             ray_view: rays.view.ptr(),
             directions: rays.directions.ptr(),
             priors: self.drawn.ptr_mut(),
-            n: rays.n,
+            n_rays: rays.n,
         };
         let work = Work::items(u64::from(rays.n)).flops(40.0).bytes(60.0);
         rec.run(&self.draw, work, args);

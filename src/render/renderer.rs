@@ -254,7 +254,7 @@ impl Renderer {
                     shot.appearance_row,
                 );
                 self.forward(rec, model, shot.now, false);
-                self.composite.normal_map(rec, &self.look(shot.now));
+                self.composite.normal_map(rec, &self.look(shot.now), model);
                 Ok(())
             })?;
             each(n.min(total - first))?;

@@ -75,7 +75,7 @@ impl Sampler {
         let args = place_samples::Args {
             jitter: draws.jitter(0),
             edges: self.levels[0].edges.ptr_mut(),
-            n,
+            n_rays: n,
             n_samples: model.proposals[0].n_samples,
             train,
         };
@@ -93,7 +93,7 @@ impl Sampler {
                 near_far: rays.near_far.ptr(),
                 edges: b.edges.ptr(),
                 points: b.points.ptr_mut(),
-                n,
+                n_rays: n,
                 n_samples,
             };
             rec.run(
@@ -115,7 +115,7 @@ impl Sampler {
                 jitter: draws.jitter(level as u64 + 1),
                 weights: b.weights.ptr_mut(),
                 new_edges: next.ptr_mut(),
-                n,
+                n_rays: n,
                 n_samples,
                 n_new,
                 train,
@@ -130,7 +130,7 @@ impl Sampler {
             edges: self.edges.ptr(),
             tap_draws: draws.per_sample(),
             points: points.ptr_mut(),
-            n,
+            n_rays: n,
             n_samples: self.n_samples,
             tap_range: now.tap_step.range,
             tap_floor: now.tap_step.floor,
@@ -169,8 +169,8 @@ impl Sampler {
                 near_far: rays.near_far.ptr(),
                 loss: loss.ptr_mut(),
                 d_raw: b.d_raw.ptr_mut(),
-                transmittance: b.cumulative.ptr_mut(),
-                n: rays.n,
+                transmittance: b.transmittance.ptr_mut(),
+                n_rays: rays.n,
                 n_final: self.n_samples,
                 n_samples: proposal.n_samples,
                 scale,

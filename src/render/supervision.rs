@@ -11,10 +11,11 @@ use crate::Result;
 use crate::config::Config;
 use crate::gpu::{Buffer, Gpu, Kernel, KernelShape, Recorder, Work};
 use crate::kernels::{mask_loss, mono_depth_loss, mono_normal_loss, sensor_depth_loss};
+use crate::model::Model;
 
 /// Kernels and results of these losses.
 pub struct Supervision {
-    /// What the picture hears from them.
+    /// Their gradients by what is rendered.
     pub d_image: Buffer<f32>, // [5, n_rays] glsl/lib/supervision.glsl
     pub priors: Option<Priors>,
     mask: Option<RayLoss<mask_loss::Args>>,
@@ -111,8 +112,15 @@ impl Supervision {
         Ok(Some(supervision))
     }
 
-    /// Every loss of the batch, and what its picture hears from all of them together.
-    pub fn run(&self, rec: &mut Recorder, views: &ViewTable, composite: &Composite, look: &Look) {
+    /// Every loss of the batch, and in `d_image` the gradients of all of them together.
+    pub fn run(
+        &self,
+        rec: &mut Recorder,
+        model: &Model,
+        views: &ViewTable,
+        composite: &Composite,
+        look: &Look,
+    ) {
         let n = self.n_rays;
         let per_ray = Work::items(u64::from(n)).flops(40.0).bytes(40.0);
         rec.fill(&self.d_image, 0..self.d_image.len(), 0);
@@ -123,7 +131,7 @@ impl Supervision {
                 ray_outside: look.rays.outside.ptr(),
                 loss: loss.values.ptr_mut(),
                 d_image: self.d_image.ptr_mut(),
-                n,
+                n_rays: n,
                 scale: loss.scale,
             };
             rec.run(&loss.kernel, per_ray, args);
@@ -139,7 +147,7 @@ impl Supervision {
                 ray_outside: look.rays.outside.ptr(),
                 loss: loss.values.ptr_mut(),
                 d_image: self.d_image.ptr_mut(),
-                n,
+                n_rays: n,
                 scale: loss.scale,
             };
             rec.run(&loss.kernel, per_ray, args);
@@ -152,14 +160,14 @@ impl Supervision {
                 ray_outside: look.rays.outside.ptr(),
                 loss: loss.values.ptr_mut(),
                 d_image: self.d_image.ptr_mut(),
-                n,
+                n_rays: n,
                 scale: loss.scale,
             };
             let work = Work::items(1).bytes(100.0 * f64::from(n));
             rec.run(&loss.kernel, work, args);
         }
         if let Some(loss) = &self.mono_normal {
-            composite.normal_map(rec, look);
+            composite.normal_map(rec, look, model);
             let args = mono_normal_loss::Args {
                 views: views.table(),
                 ray_view: look.rays.view.ptr(),
@@ -169,7 +177,7 @@ impl Supervision {
                 ray_outside: look.rays.outside.ptr(),
                 loss: loss.values.ptr_mut(),
                 d_image: self.d_image.ptr_mut(),
-                n,
+                n_rays: n,
                 scale: loss.scale,
             };
             rec.run(&loss.kernel, per_ray, args);

@@ -61,8 +61,8 @@ impl Adam {
                 rate: rates.rate,
                 decay: rates.decay,
                 correction: rates.correction,
-                share1: (1.0 - c.beta1) as f32,
-                share2: (1.0 - c.beta2) as f32,
+                one_minus_beta1: (1.0 - c.beta1) as f32,
+                one_minus_beta2: (1.0 - c.beta2) as f32,
                 epsilon: c.epsilon as f32,
             };
             rec.run(

@@ -235,7 +235,7 @@ impl Trainer {
         loss.heaviest(rec, &render.composite, &look);
         let supervision = loss.supervision.as_ref();
         if let Some(supervision) = supervision {
-            supervision.run(rec, &self.views, &render.composite, &look);
+            supervision.run(rec, model, &self.views, &render.composite, &look);
         }
         if now.bias_weight > 0.0 {
             loss.bias(rec, model, &self.scratch, now.bias_weight as f32);

@@ -122,7 +122,7 @@ impl Batch {
                 background: background.ptr(),
                 weights: weights.ptr_mut(),
                 image: image.ptr_mut(),
-                n: self.n as u32,
+                n_rays: self.n as u32,
                 n_samples: self.n_samples as u32,
             },
         );
@@ -151,7 +151,7 @@ impl Batch {
                 d_optical_depth: d[0].ptr_mut(),
                 d_rgb: d[2].ptr_mut(),
                 d_background: d[3].ptr_mut(),
-                n: self.n as u32,
+                n_rays: self.n as u32,
                 n_samples: self.n_samples as u32,
             },
         );

@@ -27,7 +27,7 @@ fn colour_loss() {
             loss: loss.ptr_mut(),
             square: square.ptr_mut(),
             d_color: d_color.ptr_mut(),
-            n: n as u32,
+            n_rays: n as u32,
             scale: 0.5 / n as f32,
         },
     );
@@ -100,7 +100,7 @@ fn heaviest_samples_and_bias_queries() {
                     queries: queries.ptr_mut(),
                     gate: gate.ptr_mut(),
                     heaviest: heaviest.ptr_mut(),
-                    n: n as u32,
+                    n_rays: n as u32,
                     n_samples: n_samples as u32,
                     eps,
                     offset,
@@ -162,7 +162,7 @@ pub fn run_bias_correction(
             gate: device.put("gate", gate).ptr(),
             loss: loss.ptr_mut(),
             d_query_sdf: d_query_sdf.ptr_mut(),
-            n: n as u32,
+            n_rays: n as u32,
             eps: eps as f32,
             scale: scale as f32,
             published: u32::from(published),
@@ -241,7 +241,7 @@ pub fn run_interlevel(rays: &[ProposalRay], weights: &[f64], scale: f64) -> (Vec
             loss: loss.ptr_mut(),
             d_raw: d_raw.ptr_mut(),
             transmittance: transmittance.ptr_mut(),
-            n: n as u32,
+            n_rays: n as u32,
             n_final: n_final as u32,
             n_samples: n_samples as u32,
             scale: scale as f32,
@@ -322,9 +322,9 @@ fn loss_sums() {
     };
     let terms: Vec<_> = buffers.iter().zip(1..).map(term).collect();
     let table = device.table("terms", &terms);
-    let (losses, non_finite) = (
+    let (losses, bad_step) = (
         device.room("losses", terms.len() + 1),
-        device.table("non_finite", &[0]),
+        device.table("bad_step", &[0]),
     );
     let sum = || {
         device.run(
@@ -333,7 +333,7 @@ fn loss_sums() {
             kernels::sum_losses::Args {
                 terms: table.ptr(),
                 losses: losses.ptr_mut(),
-                non_finite: non_finite.ptr_mut(),
+                bad_step: bad_step.ptr_mut(),
                 n_terms: terms.len() as u32,
             },
         );
@@ -348,11 +348,11 @@ fn loss_sums() {
     let got = sum();
     assert_forward("losses", &got, &want);
     assert_eq!(got, sum(), "the same values, the same sums");
-    assert_eq!(device.read(&non_finite), [0]);
+    assert_eq!(device.read(&bad_step), [0]);
     device
         .gpu
         .upload(&buffers[2], 200, &[f32::NAN])
         .expect("upload");
     sum();
-    assert_eq!(device.read(&non_finite), [1]);
+    assert_eq!(device.read(&bad_step), [1]);
 }

@@ -66,7 +66,7 @@ impl Batch {
                 ray_outside: device.table("outside", &self.outside).ptr(),
                 loss: loss.ptr_mut(),
                 d_image: d_image.ptr_mut(),
-                n: self.n as u32,
+                n_rays: self.n as u32,
                 scale: self.scale() as f32,
             },
         );
@@ -102,7 +102,7 @@ fn masks_pull_accumulated_weight_within_their_clip() {
             ray_outside: device.table("outside", &batch.outside).ptr(),
             loss: loss.ptr_mut(),
             d_image: d_image.ptr_mut(),
-            n: n as u32,
+            n_rays: n as u32,
             scale: batch.scale() as f32,
         },
     );
@@ -146,7 +146,7 @@ fn sensor_depths_count_where_they_are_known() {
             ray_outside: device.table("outside", &batch.outside).ptr(),
             loss: loss.ptr_mut(),
             d_image: d_image.ptr_mut(),
-            n: n as u32,
+            n_rays: n as u32,
             scale: batch.scale() as f32,
         },
     );
