@@ -90,7 +90,7 @@ struct Global {
     /// Nothing on stderr but errors
     #[arg(short, long, global = true, conflicts_with = "verbose")]
     quiet: bool,
-    /// More about what happens inside; twice for still more (or RUST_LOG)
+    /// Say what is decided and touched; twice, how; three times, at every step, too (RUST_LOG chooses among them)
     #[arg(short, long, global = true, action = ArgAction::Count)]
     verbose: u8,
     /// How stderr is written; json: one object a line
@@ -185,7 +185,9 @@ pub fn main() -> ExitCode {
         Color::Auto => colored_by_environment(),
     };
     let context = Context::new(&cli.global, colored);
-    diagnostics::install_log(&cli.global, colored);
+    if let Err(error) = diagnostics::install_log(&cli.global, colored) {
+        return context.fail(&error.into());
+    }
     // A panic has told its story in the hook; what is left is the exit code.
     let outcome = std::panic::catch_unwind(AssertUnwindSafe(|| cli.command.run(&context)));
     match outcome {

@@ -1,6 +1,7 @@
 //! The command line from outside: streams, exit codes, messages, and one small run from photographs to mesh.
 
 mod studies;
+mod trace;
 
 use serde_json::Value;
 use std::f64::consts::TAU;
