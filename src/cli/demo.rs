@@ -18,6 +18,7 @@ use clap::Args;
 use serde_json::json;
 
 use super::progress::Progress;
+use super::scene_args::SceneArgs;
 use super::{Context, diagnostics, interrupt};
 use crate::config::Config;
 use crate::eval::{self, GeometryOptions, GeometryScores, Reference};
@@ -118,10 +119,7 @@ pub(super) fn run(args: &DemoArgs, context: &Context) -> anyhow::Result<()> {
     let gpu = context.gpu()?;
     let config = demo.config()?;
     let scene = Scene::open(&dataset.root, &scene_options(&config))?;
-    let region = Region::estimate(
-        &scene,
-        &super::train::region_wanted(&Default::default(), &config),
-    )?;
+    let region = Region::estimate(&scene, &SceneArgs::default().region(&config))?;
     context.say(&format!("device   {}", gpu.info().name));
     // A few timed steps say where the time goes, and how many steps fit into it.
     let timing = demo.stage("timing", |demo| demo.timing(&scene, &region, &config))?;
@@ -218,15 +216,11 @@ impl<'c> Demo<'c> {
 
     /// [`Error::Interrupted`] once Ctrl-C was pressed.
     fn check(&self) -> Result<()> {
-        if self.going_on() {
-            return Ok(());
-        }
-        Err(Error::Interrupted {
-            what: format!(
-                "stopped; what was done so far is in {}",
-                self.args.out.display()
-            ),
-        })
+        let what = format!(
+            "stopped; what was done so far is in {}",
+            self.args.out.display()
+        );
+        interrupt::stop_if(&self.interrupted, &what)
     }
 
     fn photographs(&mut self) -> anyhow::Result<SyntheticDataset> {

@@ -2,6 +2,7 @@
 
 mod bench;
 mod bias;
+mod chosen;
 mod compare;
 pub mod demo;
 mod devices;

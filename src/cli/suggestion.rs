@@ -1,7 +1,6 @@
 //! Which preset a dataset asks for, by where its cameras look and what lies beyond the region; and whether another one fits.
 
 use super::scene_args::SceneArgs;
-use super::train::{region_wanted, with_scene_flags};
 use crate::Result;
 use crate::config::{BackgroundKind, Config};
 use crate::scene::{Beyond, Facing, Looks, Region, Scene, Split};
@@ -32,8 +31,8 @@ impl Suggestion {
     /// # Errors
     /// As [`Suggestion::of`] and [`Region::estimate`].
     pub fn for_scene(scene: &Scene, flags: &SceneArgs) -> Result<Suggestion> {
-        let config = with_scene_flags(flags, Config::preset("outdoor-tiny")?)?;
-        let region = Region::estimate(scene, &region_wanted(flags, &config))?;
+        let config = flags.put_into(Config::preset("outdoor-tiny")?)?;
+        let region = Region::estimate(scene, &flags.region(&config))?;
         Suggestion::of(scene, &region)
     }
 

@@ -8,6 +8,9 @@ use serde_json::{Value, json};
 use std::fmt::Write as _;
 use std::time::Instant;
 
+/// What is said of an interrupted measurement.
+pub(super) const STOPPED: &str = "stopped before all was timed";
+
 /// How many steps are timed.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Until {

@@ -1,17 +1,17 @@
 //! `neurodin train`: a dataset becomes a run directory; or an interrupted run goes on.
 
+use super::chosen::{Chosen, described, gpu_options, open_scene};
 use super::progress::{Progress, clock};
 use super::scene_args::SceneArgs;
 use super::settings::SettingsArgs;
-use super::suggestion::Suggestion;
 use super::{Context, diagnostics, interrupt};
-use crate::config::{Config, Effect, MaskUse, RegionKind};
-use crate::gpu::{Gpu, GpuOptions};
-use crate::scene::{Region, RegionOverrides, RegionShape, Scene, Split};
+use crate::config::{Config, Effect};
+use crate::gpu::Gpu;
+use crate::scene::{Region, RegionShape, Scene, Split};
 use crate::train::Trainer;
 use crate::train::checkpoint::{self, Latest};
 use crate::train::report::{Control, Event, Log};
-use crate::train::run_directory::{RunDirectory, SceneRecord, scene_options};
+use crate::train::run_directory::{RunDirectory, SceneRecord};
 use crate::{Error, Result};
 use anyhow::Context as _;
 use clap::Args;
@@ -112,81 +112,6 @@ pub(super) fn train_or_resume(
     task.run(true, context)
 }
 
-/// The scene flags' share of the settings.
-pub(super) fn with_scene_flags(args: &SceneArgs, config: Config) -> Result<Config> {
-    let mut config = config;
-    if let Some(downscale) = args.downscale {
-        config.scene.downscale = downscale;
-    }
-    if let Some(holdout) = args.holdout {
-        config.scene.holdout = holdout;
-    }
-    if let Some(scale) = args.region_scale {
-        config.scene.region_scale = scale;
-    }
-    if args.no_masks {
-        config.scene.masks = MaskUse::Ignore;
-    }
-    config.validated()
-}
-
-/// The settings for a new run, as far as they are known without looking at its dataset.
-fn described(settings: &SettingsArgs, scene: &SceneArgs) -> Result<Config> {
-    with_scene_flags(scene, settings.resolve(Config::preset("outdoor-tiny")?)?)
-}
-
-/// The settings for a new run on a dataset.
-pub(super) struct Chosen {
-    pub config: Config,
-    /// Why the preset was chosen, if it was not named.
-    pub why: String,
-    /// What speaks against it, if it was.
-    pub doubts: Vec<String>,
-}
-
-/// Chooses the settings: those that were asked for, on top of what the dataset suggests where no preset was named.
-pub(super) fn configure(
-    settings: &SettingsArgs,
-    flags: &SceneArgs,
-    scene: &Scene,
-) -> Result<Chosen> {
-    if settings.names_preset()? {
-        let config = described(settings, flags)?;
-        let region = Region::estimate(scene, &region_wanted(flags, &config))?;
-        return Ok(Chosen {
-            doubts: Suggestion::of(scene, &region)?.doubts(&config, scene, &region),
-            why: String::new(),
-            config,
-        });
-    }
-    let suggestion = Suggestion::for_scene(scene, flags)?;
-    let config = with_scene_flags(flags, settings.resolve(suggestion.config()?)?)?;
-    let region = Region::estimate(scene, &region_wanted(flags, &config))?;
-    Ok(Chosen {
-        why: suggestion.in_words(),
-        doubts: suggestion.doubts(&config, scene, &region),
-        config,
-    })
-}
-
-/// What flags and settings say of the region.
-pub(super) fn region_wanted(flags: &SceneArgs, config: &Config) -> RegionOverrides {
-    flags.overrides(&RegionOverrides {
-        scale: config.scene.region_scale,
-        prefer_box: config.scene.shape == RegionKind::Box,
-        ..RegionOverrides::default()
-    })
-}
-
-/// The dataset as the flags say it should be read; no preset says otherwise.
-pub(super) fn open_scene(
-    settings: &SettingsArgs,
-    flags: &SceneArgs,
-    dataset: &Path,
-) -> Result<Scene> {
-    Scene::open(dataset, &scene_options(&described(settings, flags)?))
-}
-
 /// Everything a run needs, on the device, with nothing written yet.
 struct Task {
     out: PathBuf,
@@ -209,9 +134,12 @@ fn begin(args: &TrainArgs, out: &Path, context: &Context) -> anyhow::Result<Task
     RunDirectory::check_free(out, args.force)?;
     let dataset = args.dataset.as_deref().expect("clap requires it");
     let scene = open_scene(&args.settings, &args.scene, dataset)?;
-    let chosen = configure(&args.settings, &args.scene, &scene)?;
-    let config = chosen.config;
-    let region = Region::estimate(&scene, &region_wanted(&args.scene, &config))?;
+    let Chosen {
+        config,
+        region,
+        why,
+        doubts,
+    } = Chosen::of(&args.settings, &args.scene, &scene)?;
     context.say(&format!(
         "dataset  {}, {}: {} views to train on, {} held out{}",
         dataset.display(),
@@ -227,11 +155,11 @@ fn begin(args: &TrainArgs, out: &Path, context: &Context) -> anyhow::Result<Task
     context.say(&format!(
         "preset   {}{}, {}, seed {}",
         config.preset,
-        chosen.why,
+        why,
         in_stages(&config),
         config.seed
     ));
-    for doubt in &chosen.doubts {
+    for doubt in &doubts {
         context.warn(doubt);
     }
     let gpu = context.gpu_with(gpu_options(&config))?;
@@ -286,15 +214,6 @@ fn in_words(region: &Region) -> String {
     )
 }
 
-/// How a configuration wants its device to work.
-pub(super) fn gpu_options(config: &Config) -> GpuOptions {
-    GpuOptions {
-        deterministic: config.deterministic,
-        matrices: config.matrices,
-        ..GpuOptions::default()
-    }
-}
-
 /// A run that is gone on with.
 struct Resumed {
     run: RunDirectory,
@@ -322,7 +241,7 @@ fn resumed(args: &TrainArgs, out: &Path) -> Result<Resumed> {
     let config = args
         .settings
         .resolve(was)
-        .and_then(|config| with_scene_flags(&args.scene, config))?;
+        .and_then(|config| args.scene.put_into(config))?;
     Ok(Resumed {
         run,
         latest,
