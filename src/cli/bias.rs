@@ -231,7 +231,7 @@ fn measure(
     let directory = RunDirectory::open(run)?;
     let gpu = context.gpu()?;
     let trained = Trained::open(&gpu, &directory)?;
-    let mut scene = trained.record.open(None, &trained.config)?;
+    let mut scene = trained.record.open(None, trained.config())?;
     let views: Vec<usize> = scene.split(Split::Test).take(args.views as usize).collect();
     if views.is_empty() {
         return Err(Error::input(run, "no view was held out", "train with --holdout 8").into());
@@ -245,7 +245,7 @@ fn measure(
     }
     let names = render::file_names(&scene);
     // As many samples at once as in training.
-    let config = &trained.config;
+    let config = trained.config();
     let rays = (config.rays * config.sampling.samples / args.samples).max(8);
     let viewer = trained.fine_viewer(&scene, rays, args.samples)?;
     let interrupted = interrupt::flag("stopping")?;

@@ -72,18 +72,18 @@ pub(super) fn run(args: &TrainArgs, context: &Context) -> anyhow::Result<()> {
         context.say("dry run: nothing was written");
         return Ok(context.result(&json!({ "dry_run": true, "config": task.config }), "")?);
     }
-    let (result, text) = task.run(args.force, context)?;
-    Ok(context.result(&result, &text)?)
+    let done = task.run(args.force, context)?;
+    Ok(context.result(&done.to_json(), &done.text())?)
 }
 
-/// Trains on a dataset into `out`, or where a run of it is there already goes on with that; what it led to, for programs and for people.
+/// Trains on a dataset into `out`, or where a run of it is there already goes on with that.
 pub(super) fn train_or_resume(
     dataset: &Path,
     out: &Path,
     settings: SettingsArgs,
     scene: SceneArgs,
     context: &Context,
-) -> anyhow::Result<(Value, String)> {
+) -> anyhow::Result<Done> {
     let has_checkpoint = RunDirectory::open(out)
         .and_then(|run| checkpoint::latest(&run.checkpoints()))
         .is_ok();
@@ -113,7 +113,7 @@ pub(super) fn train_or_resume(
 }
 
 /// Everything a run needs, on the device, with nothing written yet.
-struct Task {
+pub(super) struct Task {
     out: PathBuf,
     config: Config,
     scene: Scene,
@@ -121,6 +121,41 @@ struct Task {
     trainer: Trainer,
     /// The checkpoint that it goes on from.
     resumed: Option<PathBuf>,
+}
+
+/// What training came to.
+pub(super) struct Done {
+    run: PathBuf,
+    /// Steps done in all stages, also before it was resumed.
+    pub steps: u64,
+    took: Duration,
+    /// Device memory of the stage that took most.
+    pub device_bytes: u64,
+    /// Of the last preview, in dB.
+    preview_psnr: Option<f64>,
+    checkpoint: Option<PathBuf>,
+}
+
+impl Done {
+    fn to_json(&self) -> Value {
+        json!({
+            "run": self.run,
+            "step": self.steps,
+            "seconds": self.took.as_secs_f64(),
+            "device_bytes": self.device_bytes,
+            "preview_psnr": self.preview_psnr,
+            "checkpoint": self.checkpoint,
+        })
+    }
+
+    fn text(&self) -> String {
+        format!(
+            "done     {} steps in {}; next: neurodin mesh {} -o mesh.ply",
+            self.steps,
+            clock(self.took),
+            self.run.display()
+        )
+    }
 }
 
 /// A new run.
@@ -163,16 +198,9 @@ fn begin(args: &TrainArgs, out: &Path, context: &Context) -> anyhow::Result<Task
         context.warn(doubt);
     }
     let gpu = context.gpu_with(gpu_options(&config))?;
-    let trainer = Trainer::new(&gpu, &scene, &region, &config)?;
+    let task = Task::new(&gpu, dataset, scene, &region, config, out)?;
     say_device(&gpu, args.dry_run, context);
-    Ok(Task {
-        out: out.into(),
-        record: SceneRecord::new(dataset, &scene, &region)?,
-        config,
-        scene,
-        trainer,
-        resumed: None,
-    })
+    Ok(task)
 }
 
 /// The device, and what of its memory is used from here to the end: everything is allocated before the first step.
@@ -317,8 +345,33 @@ fn resume(args: &TrainArgs, out: &Path, context: &Context) -> anyhow::Result<Tas
 }
 
 impl Task {
-    /// To the end: what it led to, for programs and for people.
-    fn run(mut self, force: bool, context: &Context) -> anyhow::Result<(Value, String)> {
+    /// A new run into `out`, on a scene that was opened from `dataset`.
+    ///
+    /// # Errors
+    /// Those of [`Trainer::new`] and [`SceneRecord::new`].
+    pub fn new(
+        gpu: &Gpu,
+        dataset: &Path,
+        scene: Scene,
+        region: &Region,
+        config: Config,
+        out: &Path,
+    ) -> Result<Task> {
+        Ok(Task {
+            out: out.into(),
+            record: SceneRecord::new(dataset, &scene, region)?,
+            trainer: Trainer::new(gpu, &scene, region, &config)?,
+            config,
+            scene,
+            resumed: None,
+        })
+    }
+
+    /// To the end. `force` replaces a run that is there already.
+    ///
+    /// # Errors
+    /// [`Error::Interrupted`] after Ctrl-C, with a checkpoint saved; those of writing the run directory and of [`Trainer::run`].
+    pub fn run(mut self, force: bool, context: &Context) -> anyhow::Result<Done> {
         let run = match &self.resumed {
             Some(_) => RunDirectory::resume(&self.out)?,
             None => RunDirectory::create(&self.out, force)?,
@@ -371,22 +424,14 @@ impl Task {
             Some(path) => format!("the last checkpoint is {}", path.display()),
             None => "there is no checkpoint of this run yet".into(),
         })?;
-        let seconds = begun.elapsed();
-        let result = json!({
-            "run": run.root(),
-            "step": steps_done,
-            "seconds": seconds.as_secs_f64(),
-            "device_bytes": device_bytes,
-            "preview_psnr": psnr,
-            "checkpoint": checkpoint,
-        });
-        let text = format!(
-            "done     {} steps in {}; next: neurodin mesh {} -o mesh.ply",
-            steps_done,
-            clock(seconds),
-            run.root().display()
-        );
-        Ok((result, text))
+        Ok(Done {
+            run: run.root().into(),
+            steps: steps_done,
+            took: begun.elapsed(),
+            device_bytes,
+            preview_psnr: psnr,
+            checkpoint,
+        })
     }
 }
 
