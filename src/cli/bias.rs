@@ -238,10 +238,7 @@ fn measure(
     }
     for &view in &views {
         let camera = &mut scene.views[view].camera;
-        let pixels = f64::from(camera.width) * f64::from(camera.height);
-        let factor = (args.pixels as f64 / pixels).sqrt().min(1.0);
-        let reduced = |size: u32| ((f64::from(size) * factor) as u32).max(1);
-        *camera = camera.scaled(reduced(camera.width), reduced(camera.height));
+        *camera = camera.within(args.pixels);
     }
     let names = render::file_names(&scene);
     // As many samples at once as in training.

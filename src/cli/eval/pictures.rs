@@ -143,11 +143,7 @@ pub(in crate::cli) fn score(
 /// PSNR and SSIM of a rendering; with `masked`, of what its mask keeps.
 fn compare(rendered: &Rendered, picture: &Picture, masked: bool) -> (f64, Option<f64>) {
     let counts = |pixel: &[u8]| !masked || pixel[3] >= 128;
-    let photo: Vec<f32> = picture
-        .rgba
-        .chunks_exact(4)
-        .flat_map(|pixel| [0, 1, 2].map(|c| f32::from(pixel[c]) / 255.0))
-        .collect();
+    let photo = picture.rgb();
     // What does not count is made equal, and left out of the mean.
     let ours: Vec<f32> = rendered
         .rgb
