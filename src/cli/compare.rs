@@ -3,7 +3,6 @@
 mod report;
 mod table;
 
-use super::demo::mesh_picture::{Eye, Lens, Rgb, Visible, clay, sun_eye};
 use super::eval::{self, EvalArgs};
 use super::mesh::{self, MeshArgs, NO_SURFACE};
 use super::scene_args::{SceneArgs, numbers};
@@ -11,6 +10,8 @@ use super::settings::SettingsArgs;
 use super::{Context, train};
 use crate::config::{Config, METHODS};
 use crate::mesh::{Mesh, read_mesh};
+use crate::picture::Rgb;
+use crate::picture::surface::{Eye, Lens, Visible, clay, sun_eye};
 use crate::scene::{Camera, Region, Split};
 use crate::train::run_directory::{RunDirectory, SceneRecord};
 use crate::{Error, Result};

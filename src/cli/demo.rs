@@ -3,8 +3,6 @@
 //! Every stage is what a user's own photographs go through: a dataset on disk, a run directory, a mesh file. Only the surface is known
 //! here, so that the mesh can be scored against the truth.
 
-pub mod chart;
-pub mod mesh_picture;
 pub mod report;
 mod summary;
 

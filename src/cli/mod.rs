@@ -12,6 +12,7 @@ mod inspect;
 mod interrupt;
 mod mesh;
 mod output;
+mod page;
 mod profile;
 mod progress;
 mod render;

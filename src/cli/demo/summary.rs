@@ -5,11 +5,12 @@ use std::path::Path;
 use glam::{DVec3, dvec3};
 use serde_json::{Value, json};
 
-use super::chart::{Chart, Series, grouped, short};
-use super::mesh_picture::{Eye, Lens, Rgb, Visible, clay, colors, sun_eye};
-use super::report::{Headline, KernelRow, Report, Threshold, depth_picture, normal_picture};
+use super::report::{Headline, KernelRow, Report, Threshold};
 use super::{Outcome, Seen, report};
 use crate::mesh::Mesh;
+use crate::picture::chart::{Chart, Series, grouped, short};
+use crate::picture::surface::{Eye, Lens, Visible, clay, colors, sun_eye};
+use crate::picture::{Rgb, depth_picture, normal_picture};
 use crate::scene::synthetic::{CENTER, RADIUS, look};
 
 /// Sides from which the mesh is shown: azimuth and elevation in degrees.
