@@ -29,7 +29,8 @@ Example:
   neurodin train --out run --resume
   neurodin train --preset indoor-tiny --print-config > mine.toml")]
 pub(super) struct TrainArgs {
-    /// Directory of the dataset, its transforms.json, meta_data.json or cameras_sphere.npz, or the directory of a COLMAP model; with --resume only if it has moved
+    /// Directory of the dataset, its transforms.json, meta_data.json or cameras_sphere.npz, or the directory of a COLMAP model; with
+    /// --resume only if it has moved
     #[arg(required_unless_present_any = ["resume", "print_config"])]
     pub dataset: Option<PathBuf>,
     /// Run directory to write
