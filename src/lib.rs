@@ -13,6 +13,7 @@ pub mod gpu;
 pub mod kernels;
 pub mod mesh;
 pub mod model;
+pub mod picture;
 pub mod render;
 pub mod scene;
 pub mod train;

@@ -2,7 +2,6 @@
 
 use std::fs;
 use std::path::Path;
-use std::process::Command;
 
 use glam::{DMat4, DVec2, DVec3, dvec2, dvec3};
 use neurodin::Error;
@@ -255,97 +254,4 @@ fn photographs_agree_with_the_surface_at_the_stated_poses() {
             );
         }
     }
-}
-
-/// The program, started the way cargo starts this test.
-fn neurodin() -> Command {
-    let program = env!("CARGO_BIN_EXE_neurodin");
-    match std::env::var("CARGO_TARGET_X86_64_UNKNOWN_LINUX_GNU_RUNNER") {
-        Ok(runner) if cfg!(all(target_arch = "x86_64", target_os = "linux")) => {
-            let mut words = runner.split_whitespace();
-            let mut command = Command::new(words.next().expect("a runner has a name"));
-            command.args(words).arg(program);
-            command
-        }
-        _ => Command::new(program),
-    }
-}
-
-#[test]
-fn a_small_demo_goes_all_the_way() {
-    let folder = tempfile::tempdir().unwrap();
-    let out = folder.path().join("tour");
-    let run = |extra: &[&str]| {
-        let small = [
-            "--views",
-            "8",
-            "--width",
-            "64",
-            "--steps",
-            "20",
-            "--resolution",
-            "48",
-        ];
-        neurodin()
-            .args(["demo", "--json", "--out"])
-            .arg(&out)
-            .args(small)
-            .args(extra)
-            .output()
-            .unwrap()
-    };
-    let first = run(&[]);
-    let told = String::from_utf8_lossy(&first.stderr);
-    assert!(first.status.success(), "{told}");
-
-    let result: serde_json::Value = serde_json::from_slice(&first.stdout).unwrap();
-    assert_eq!(result["steps"].as_u64(), Some(20));
-    assert!(result["psnr"].as_f64().unwrap() > 5.0, "{result:#}");
-    assert_eq!(
-        result["geometry"]["thresholds"].as_array().unwrap().len(),
-        3
-    );
-    for file in [
-        "dataset/transforms.json",
-        "dataset/ground_truth/surface.ply",
-        "run/log.jsonl",
-        "mesh.ply",
-        "scores.json",
-        "report.html",
-        "pictures/mesh_clay.png",
-    ] {
-        assert!(out.join(file).is_file(), "{file} is missing");
-    }
-    let page = fs::read_to_string(out.join("report.html")).unwrap();
-    for text in [
-        "Held-out views",
-        "Device time per kernel",
-        "hash_grid",
-        "F-score",
-        "rays = 256",
-    ] {
-        assert!(page.contains(text), "the report lacks {text:?}");
-    }
-    // Two held-out views of four pictures, two large ones, four sides of three.
-    assert_eq!(page.matches("<img").count(), 2 * 4 + 2 + 4 * 3);
-
-    // A second demo does not write over the first, unless it is told to.
-    let again = run(&[]);
-    assert_eq!(again.status.code(), Some(8));
-    assert_eq!(fs::read_to_string(out.join("report.html")).unwrap(), page);
-
-    // Nor does it ever remove what no demo has written.
-    let mine = folder.path().join("mine");
-    fs::create_dir(&mine).unwrap();
-    fs::write(mine.join("mesh.ply"), "precious").unwrap();
-    let refused = neurodin()
-        .args(["demo", "--force", "--out"])
-        .arg(&mine)
-        .output()
-        .unwrap();
-    assert_eq!(refused.status.code(), Some(8));
-    assert_eq!(
-        fs::read_to_string(mine.join("mesh.ply")).unwrap(),
-        "precious"
-    );
 }

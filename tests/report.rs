@@ -1,10 +1,8 @@
 //! The demo's report: self-contained, complete, and well-formed whatever goes into it.
 
-use neurodin::cli::demo::chart::{Chart, Series};
-use neurodin::cli::demo::mesh_picture::Rgb;
-use neurodin::cli::demo::report::{
-    Headline, KernelRow, Report, Threshold, View, depth_picture, duration, normal_picture,
-};
+use neurodin::cli::demo::report::{Headline, KernelRow, Report, Threshold, View, duration};
+use neurodin::picture::chart::{Chart, Series};
+use neurodin::picture::{Rgb, depth_picture, normal_picture};
 
 fn picture(shade: u8) -> Rgb {
     Rgb {

@@ -2,11 +2,11 @@
 
 mod between;
 
-use super::profile::stop_if;
+use super::Context;
+use super::interrupt::{self, stop_if};
 use super::progress::Progress;
-use super::timing::{Timed, Until, time};
-use super::train::region_wanted;
-use super::{Context, interrupt};
+use super::scene_args::SceneArgs;
+use super::timing::{STOPPED, Timed, Until, time};
 use crate::config::Config;
 use crate::gpu::{DeviceKind, GpuOptions, Roofs, TableRoofs};
 use crate::scene::synthetic::SyntheticOptions;
@@ -261,7 +261,7 @@ impl<'c> Bench<'c> {
             ..GpuOptions::default()
         })?;
         let scene = Scene::open(&self.folder, &scene_options(config))?;
-        let region = Region::estimate(&scene, &region_wanted(&Default::default(), config))?;
+        let region = Region::estimate(&scene, &SceneArgs::default().region(config))?;
         let mut trainer = Trainer::new(&gpu, &scene, &region, config)?;
         let start = Instant::now();
         let timed = time(
@@ -273,7 +273,7 @@ impl<'c> Bench<'c> {
                 let seconds = start.elapsed().as_secs_f64().min(self.seconds);
                 let done = self.measured.get() + seconds;
                 self.progress.borrow_mut().at(done as u64, what);
-                stop_if(&self.interrupted)
+                stop_if(&self.interrupted, STOPPED)
             },
         )?;
         self.measured.set(self.measured.get() + self.seconds);

@@ -231,21 +231,18 @@ fn measure(
     let directory = RunDirectory::open(run)?;
     let gpu = context.gpu()?;
     let trained = Trained::open(&gpu, &directory)?;
-    let mut scene = trained.record.open(None, &trained.config)?;
+    let mut scene = trained.record.open(None, trained.config())?;
     let views: Vec<usize> = scene.split(Split::Test).take(args.views as usize).collect();
     if views.is_empty() {
         return Err(Error::input(run, "no view was held out", "train with --holdout 8").into());
     }
     for &view in &views {
         let camera = &mut scene.views[view].camera;
-        let pixels = f64::from(camera.width) * f64::from(camera.height);
-        let factor = (args.pixels as f64 / pixels).sqrt().min(1.0);
-        let reduced = |size: u32| ((f64::from(size) * factor) as u32).max(1);
-        *camera = camera.scaled(reduced(camera.width), reduced(camera.height));
+        *camera = camera.within(args.pixels);
     }
     let names = render::file_names(&scene);
     // As many samples at once as in training.
-    let config = &trained.config;
+    let config = trained.config();
     let rays = (config.rays * config.sampling.samples / args.samples).max(8);
     let viewer = trained.fine_viewer(&scene, rays, args.samples)?;
     let interrupted = interrupt::flag("stopping")?;

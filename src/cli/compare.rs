@@ -3,16 +3,19 @@
 mod report;
 mod table;
 
-use super::demo::mesh_picture::{Eye, Lens, Rgb, Visible, clay, sun_eye};
+use super::eval::{self, EvalArgs};
+use super::mesh::{self, MeshArgs, NO_SURFACE};
 use super::scene_args::{SceneArgs, numbers};
 use super::settings::SettingsArgs;
-use super::{Context, eval, mesh, train};
+use super::{Context, train};
 use crate::config::{Config, METHODS};
 use crate::mesh::{Mesh, read_mesh};
+use crate::picture::Rgb;
+use crate::picture::surface::{Eye, Lens, Visible, clay, sun_eye};
 use crate::scene::{Camera, Region, Split};
 use crate::train::run_directory::{RunDirectory, SceneRecord};
 use crate::{Error, Result};
-use clap::{Args, Parser};
+use clap::Args;
 use glam::{DMat4, dvec2};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
@@ -163,27 +166,23 @@ fn one_run(
         };
     }
     context.say(&format!("\n{method}, seed {seed}: {}", run.display()));
-    let (trained, _) =
+    let trained =
         train::train_or_resume(&args.dataset, &run, settings, args.scene.clone(), context)?;
-    let no_mesh = take_mesh(args, &run, context)?;
-    let words = ["eval".into(), run.display().to_string()];
-    let (pictures, _) = eval::score(&Eval::parse_from(words).args, context)?;
-    let geometry = match (&no_mesh, args.reference.is_empty()) {
-        (None, false) => {
-            let scored = Eval::parse_from(geometry_words(args, &run)).args;
-            Some(eval::score(&scored, context)?.0)
-        }
-        _ => None,
+    let has_mesh = take_mesh(args, &run, context)?;
+    let pictures = eval::pictures::score(&run, None, None, context, &mut |_, _| {})?;
+    let geometry = match has_mesh && !args.reference.is_empty() {
+        true => Some(score_mesh(args, &run.join("mesh.ply"))?),
+        false => None,
     };
     let scores = Scores {
         method: method.into(),
         seed,
-        steps: trained["step"].as_u64().unwrap_or(0),
+        steps: trained.steps,
         seconds_per_step: seconds_per_step(&run)?,
-        device_bytes: trained["device_bytes"].as_u64().unwrap_or(0),
-        psnr: pictures["psnr"].as_f64(),
-        ssim: pictures["ssim"].as_f64(),
-        no_mesh,
+        device_bytes: trained.device_bytes,
+        psnr: pictures.psnr(),
+        ssim: pictures.ssim(),
+        no_mesh: (!has_mesh).then(|| NO_SURFACE.into()),
         geometry,
     };
     let text = serde_json::to_string_pretty(&scores).expect("plain numbers and text");
@@ -195,62 +194,31 @@ fn directory(args: &CompareArgs, method: &str, nth: u32) -> PathBuf {
     args.out.join(format!("{method}-{nth}"))
 }
 
-/// The run's mesh as `mesh.ply` in its directory; why there is none, if so, which is a result.
-fn take_mesh(args: &CompareArgs, run: &Path, context: &Context) -> anyhow::Result<Option<String>> {
-    #[derive(Parser)]
-    struct Command {
-        #[command(flatten)]
-        args: mesh::MeshArgs,
-    }
-    let words = [
-        "mesh".into(),
-        run.display().to_string(),
-        "--force".into(),
-        format!("--resolution={}", args.resolution),
-    ];
-    match mesh::take(&Command::parse_from(words).args, context) {
-        Ok(_) => Ok(None),
-        Err(error) => match error.downcast_ref::<Error>() {
-            Some(Error::Input { what, .. }) if what.contains("no zero surface") => {
-                context.warn(&format!("{}: {what}", run.display()));
-                Ok(Some(what.clone()))
-            }
-            _ => Err(error),
-        },
-    }
-}
-
-/// `neurodin eval`, called from within.
-#[derive(Parser)]
-struct Eval {
-    #[command(flatten)]
-    args: eval::EvalArgs,
-}
-
-/// The `neurodin eval` of a run's mesh.
-fn geometry_words(args: &CompareArgs, run: &Path) -> Vec<String> {
-    let listed = |numbers: &[f64]| {
-        let numbers: Vec<String> = numbers.iter().map(f64::to_string).collect();
-        numbers.join(",")
+/// Writes the run's mesh as `mesh.ply` into its directory; whether there is one, since to have none is a result.
+fn take_mesh(args: &CompareArgs, run: &Path, context: &Context) -> anyhow::Result<bool> {
+    let wanted = MeshArgs {
+        run: run.into(),
+        resolution: args.resolution,
+        force: true,
+        ..MeshArgs::default()
     };
-    let mut words = vec![
-        "eval".to_string(),
-        "--mesh".into(),
-        run.join("mesh.ply").display().to_string(),
-    ];
-    for reference in &args.reference {
-        words.extend(["--reference".into(), reference.display().to_string()]);
+    let written = mesh::take(&wanted, context)?;
+    if written.is_none() {
+        context.warn(&format!("{}: {NO_SURFACE}", run.display()));
     }
-    if !args.thresholds.is_empty() {
-        words.push(format!("--thresholds={}", listed(&args.thresholds)));
-    }
-    if let Some(crop) = &args.crop {
-        words.push(format!("--crop={}", listed(crop)));
-    }
-    if !args.unseen {
-        words.extend(["--visible-from".into(), args.dataset.display().to_string()]);
-    }
-    words
+    Ok(written.is_some())
+}
+
+/// Scores a run's mesh as `neurodin eval --mesh` does.
+fn score_mesh(args: &CompareArgs, mesh: &Path) -> Result<Value> {
+    let wanted = EvalArgs {
+        reference: args.reference.clone(),
+        thresholds: args.thresholds.clone(),
+        crop: args.crop,
+        visible_from: (!args.unseen).then(|| args.dataset.clone()),
+        ..EvalArgs::default()
+    };
+    Ok(eval::score_mesh(&wanted, mesh)?.0)
 }
 
 /// Mean over the log's lines, which stand at equal distances in steps, also where the run was interrupted.

@@ -3,32 +3,34 @@
 //! Every stage is what a user's own photographs go through: a dataset on disk, a run directory, a mesh file. Only the surface is known
 //! here, so that the mesh can be scored against the truth.
 
-pub mod chart;
-pub mod mesh_picture;
 pub mod report;
 mod summary;
 
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::AtomicBool;
 use std::time::Instant;
 
-use anyhow::Context as _;
 use clap::Args;
 use serde_json::json;
 
+use super::chosen::gpu_options;
+use super::eval::pictures;
+use super::mesh::{self, MeshArgs};
 use super::progress::Progress;
-use super::{Context, diagnostics, interrupt};
+use super::scene_args::SceneArgs;
+use super::timing::{Timed, Until, time};
+use super::train::Task;
+use super::{Context, interrupt};
 use crate::config::Config;
 use crate::eval::{self, GeometryOptions, GeometryScores, Reference};
-use crate::gpu::{Gpu, GpuOptions, Profile};
-use crate::mesh::{self, ExtractOptions, Field, Mesh};
+use crate::gpu::{DeviceInfo, GpuOptions};
+use crate::mesh::{Mesh, read_mesh};
 use crate::render::Rendered;
 use crate::scene::synthetic::{self, SyntheticDataset, SyntheticOptions};
 use crate::scene::{Picture, Region, Scene, Split, View};
 use crate::train::Trainer;
-use crate::train::report::{Control, Event, Log};
-use crate::train::run_directory::{RunDirectory, SceneRecord, scene_options};
+use crate::train::run_directory::{RunDirectory, scene_options};
 use crate::{Error, Result};
 
 /// Reconstruct the built-in scene and report on it
@@ -88,11 +90,9 @@ const THRESHOLDS: [f64; 3] = [0.005, 0.01, 0.02];
 pub(super) struct Outcome {
     dataset: SyntheticDataset,
     config: Config,
-    device: String,
-    driver: String,
-    profile: Profile,
-    /// Share of the timed steps' wall time that the kernels' times cover.
-    coverage: f64,
+    device: DeviceInfo,
+    /// Some steps before the training, kernel by kernel.
+    timed: Timed,
     views: Vec<Seen>,
     mesh: Mesh,
     scores: GeometryScores,
@@ -113,32 +113,24 @@ pub(super) struct Seen {
 
 pub(super) fn run(args: &DemoArgs, context: &Context) -> anyhow::Result<()> {
     let mut demo = Demo::begin(args, context)?;
-    // Photographs, and the device: the two things that a reconstruction needs.
     let dataset = demo.stage("photographs", Demo::photographs)?;
-    let gpu = context.gpu()?;
     let config = demo.config()?;
     let scene = Scene::open(&dataset.root, &scene_options(&config))?;
-    let region = Region::estimate(
-        &scene,
-        &super::train::region_wanted(&Default::default(), &config),
-    )?;
-    context.say(&format!("device   {}", gpu.info().name));
+    let region = Region::estimate(&scene, &SceneArgs::default().region(&config))?;
     // A few timed steps say where the time goes, and how many steps fit into it.
-    let timing = demo.stage("timing", |demo| demo.timing(&scene, &region, &config))?;
-    let config = demo.with_steps(config, timing.seconds_per_step)?;
-    // What `neurodin train`, `mesh`, `render` and `eval` do.
-    let trainer = demo.stage("training", |demo| {
-        demo.training(&gpu, &scene, &region, &config, &dataset)
+    let timed = demo.stage("timing", |demo| demo.timing(&scene, &region, &config))?;
+    let config = demo.with_steps(config, 1e-3 * timed.wall_ms / timed.steps as f64)?;
+    // What `neurodin train`, `mesh` and `eval` do.
+    let device = demo.stage("training", |demo| {
+        demo.training(scene.clone(), &region, &config, &dataset)
     })?;
-    let mesh = demo.stage("mesh", |demo| demo.mesh(&gpu, &trainer, &region))?;
-    let views = demo.stage("held-out views", |demo| demo.views(&trainer, &scene))?;
+    let mesh = demo.stage("mesh", Demo::mesh)?;
+    let views = demo.stage("held-out views", Demo::views)?;
     let scores = demo.stage("scores", |_| scores(&mesh, &dataset, &scene))?;
     let outcome = Outcome {
-        device: gpu.info().name.clone(),
-        driver: gpu.info().driver.clone(),
+        device,
         log: demo.log()?,
-        profile: timing.profile,
-        coverage: timing.coverage,
+        timed,
         dataset,
         config,
         views,
@@ -157,13 +149,6 @@ struct Demo<'c> {
     began: Instant,
     /// Stage and seconds, as they end.
     stages: Vec<(String, f64)>,
-}
-
-/// What a few steps took.
-struct Timing {
-    seconds_per_step: f64,
-    profile: Profile,
-    coverage: f64,
 }
 
 impl<'c> Demo<'c> {
@@ -212,21 +197,13 @@ impl<'c> Demo<'c> {
         Ok(result)
     }
 
-    fn going_on(&self) -> bool {
-        !self.interrupted.load(Ordering::SeqCst)
-    }
-
     /// [`Error::Interrupted`] once Ctrl-C was pressed.
     fn check(&self) -> Result<()> {
-        if self.going_on() {
-            return Ok(());
-        }
-        Err(Error::Interrupted {
-            what: format!(
-                "stopped; what was done so far is in {}",
-                self.args.out.display()
-            ),
-        })
+        let what = format!(
+            "stopped; what was done so far is in {}",
+            self.args.out.display()
+        );
+        interrupt::stop_if(&self.interrupted, &what)
     }
 
     fn photographs(&mut self) -> anyhow::Result<SyntheticDataset> {
@@ -271,43 +248,34 @@ impl<'c> Demo<'c> {
     }
 
     /// Trains for a few steps that are thrown away: the first ones compile the kernels, the others are timed, kernel by kernel.
-    fn timing(
-        &mut self,
-        scene: &Scene,
-        region: &Region,
-        config: &Config,
-    ) -> anyhow::Result<Timing> {
+    fn timing(&mut self, scene: &Scene, region: &Region, config: &Config) -> anyhow::Result<Timed> {
         let gpu = self.context.gpu_with(GpuOptions {
             profile: true,
-            ..GpuOptions::default()
+            ..gpu_options(config)
         })?;
+        self.context.say(&format!("device   {}", gpu.info().name));
         let mut trainer = Trainer::new(&gpu, scene, region, config)?;
         let mut progress = Progress::new(self.context, "timing", WARMUP + TIMED);
-        let mut steps = |trainer: &mut Trainer, count: u64, note: &str| -> Result<()> {
-            for _ in 0..count {
-                trainer.step()?;
-                progress.at(trainer.steps_done(), note);
-                self.check()?;
-            }
-            trainer.finish()?;
-            Ok(())
-        };
-        steps(&mut trainer, WARMUP, "the device compiles the kernels")?;
-        gpu.reset_profile()?;
-        let begun = Instant::now();
-        steps(&mut trainer, TIMED, "")?;
-        let wall = begun.elapsed().as_secs_f64();
+        let timed = time(
+            &gpu,
+            &mut trainer,
+            WARMUP,
+            Until::Steps(TIMED),
+            &mut |step| {
+                let note = match step <= WARMUP {
+                    true => "the device compiles the kernels",
+                    false => "",
+                };
+                progress.at(step, note);
+                self.check()
+            },
+        )?;
         drop(progress);
-        let profile = gpu.profile()?;
-        let device: f64 = profile.rows.iter().map(|row| row.total_ms * 1e-3).sum();
-        let seconds_per_step = wall / TIMED as f64;
-        self.context
-            .say(&format!("{:.1} ms a step", 1e3 * seconds_per_step));
-        Ok(Timing {
-            seconds_per_step,
-            profile,
-            coverage: device / wall,
-        })
+        self.context.say(&format!(
+            "{:.1} ms a step",
+            timed.wall_ms / timed.steps as f64
+        ));
+        Ok(timed)
     }
 
     /// As many steps as were asked for, or as fit into the time.
@@ -329,135 +297,56 @@ impl<'c> Demo<'c> {
             .with_assignment(&format!("report.log_steps={}", (steps / 400).max(1)))
     }
 
-    /// A run directory as `neurodin train` makes it.
+    /// A run directory as `neurodin train` makes it; the device that it was trained on.
     fn training(
         &mut self,
-        gpu: &Gpu,
-        scene: &Scene,
+        scene: Scene,
         region: &Region,
         config: &Config,
         dataset: &SyntheticDataset,
-    ) -> anyhow::Result<Trainer> {
-        let run = RunDirectory::create(&self.args.out.join(RUN), false)?;
-        run.write(
-            &run.scene(),
-            &SceneRecord::new(&dataset.root, scene, region)?.to_json(),
-        )?;
-        run.write(&run.config(), &config.to_toml())?;
-        let mut trainer = Trainer::new(gpu, scene, region, config)?;
-        let mut log = Log::append(&run.log())?;
-        let mut progress = Progress::new(self.context, "train", config.steps);
-        let (mut losses_now, mut psnr_now, mut failed) = (String::new(), String::new(), None);
-        let outcome = trainer.run(scene, &run, &mut |event| {
-            if let Err(error) = log.write(&event) {
-                failed.get_or_insert(error);
-            }
-            match &event {
-                Event::Advanced { step, .. } => {
-                    diagnostics::note_step(*step);
-                    progress.at(*step, &format!("{losses_now}{psnr_now}"));
-                }
-                Event::Step { losses, .. } => losses_now = format!("loss {:.4}", losses.total),
-                Event::Preview { psnr, .. } => psnr_now = format!(", held-out view {psnr:.2} dB"),
-                Event::Saved { path, .. } => diagnostics::note_checkpoint(path),
-                Event::Warning { what, .. } => self.context.warn(what),
-                _ => {}
-            }
-            match failed.is_none() && self.going_on() {
-                true => Control::Continue,
-                false => Control::Stop,
-            }
-        });
-        if let Some(error) = failed {
-            return Err(error.into());
-        }
-        outcome.context("while training")?;
-        Ok(trainer)
+    ) -> anyhow::Result<DeviceInfo> {
+        let gpu = self.context.gpu_with(gpu_options(config))?;
+        let run = self.args.out.join(RUN);
+        let task = Task::new(&gpu, &dataset.root, scene, region, config.clone(), &run)?;
+        task.run(false, self.context)?;
+        Ok(gpu.info().clone())
     }
 
     /// `mesh.ply` of the part of the region that the photographs are about.
-    fn mesh(&mut self, gpu: &Gpu, trainer: &Trainer, region: &Region) -> anyhow::Result<Mesh> {
-        let options = ExtractOptions {
+    fn mesh(&mut self) -> anyhow::Result<Mesh> {
+        let run = self.args.out.join(RUN);
+        let [low, high] = [-synthetic::RADIUS, synthetic::RADIUS]
+            .map(|offset| (synthetic::CENTER + offset).to_array());
+        let wanted = MeshArgs {
+            run: run.clone(),
+            out: Some(self.args.out.join(MESH)),
             resolution: self.args.resolution,
-            shape: region.shape,
-            world_from_region: region.world_from_region(),
-            crop: Some([
-                synthetic::CENTER - synthetic::RADIUS,
-                synthetic::CENTER + synthetic::RADIUS,
-            ]),
-            steepest: Some(4.0),
-            ..ExtractOptions::default()
+            crop: Some([low[0], low[1], low[2], high[0], high[1], high[2]]),
+            force: self.args.force,
+            ..MeshArgs::default()
         };
-        trainer.catch_up()?;
-        let mut field = Field::new(gpu, trainer.config(), trainer.model(), trainer.annealed())?;
-        let mut shown: Option<(mesh::extract::Stage, Progress)> = None;
-        let mesh = mesh::extract_mesh(&mut field, &options, &mut |now| {
-            if shown.as_ref().is_none_or(|(stage, _)| *stage != now.stage) {
-                let what = match now.stage {
-                    mesh::extract::Stage::Lattice => "surface",
-                    mesh::extract::Stage::Attributes => "colours",
-                };
-                shown = None;
-                shown = Some((now.stage, Progress::new(self.context, what, now.total)));
-            }
-            if let Some((_, progress)) = &mut shown {
-                progress.at(now.done, &format!("{} faces", now.faces));
-            }
-            self.going_on()
-        })?;
-        drop(shown);
-        let path = self.args.out.join(MESH);
-        mesh::write_mesh(&path, &mesh, self.args.force)?;
-        self.context.say(&format!(
-            "{} vertices, {} faces in {}",
-            mesh.positions.len(),
-            mesh.faces.len(),
-            path.display()
-        ));
-        Ok(mesh)
+        let written = mesh::take(&wanted, self.context)?.ok_or_else(|| mesh::no_surface(&run))?;
+        self.context.say(&written.text());
+        Ok(written.mesh)
     }
 
     /// Renders every held-out view at its photograph's size.
-    fn views(&mut self, trainer: &Trainer, scene: &Scene) -> anyhow::Result<Vec<Seen>> {
-        let wanted: Vec<usize> = scene.split(Split::Test).collect();
-        let pixels = |view: usize| {
-            let camera = &scene.views[view].camera;
-            u64::from(camera.width) * u64::from(camera.height)
-        };
-        let total = wanted.iter().map(|&view| pixels(view)).sum();
-        let mut progress = Progress::new(self.context, "render", total);
-        let mut done = 0;
-        let mut views = Vec::new();
-        for &view in &wanted {
-            let View { name, camera, .. } = &scene.views[view];
-            let size = (camera.width, camera.height);
-            let rendered = trainer.render(view, size, &mut |share| {
-                progress.at(done + (share * pixels(view) as f64) as u64, name);
-                self.going_on()
-            })?;
-            done += pixels(view);
-            let picture = scene.load_picture(view)?;
-            let photo: Vec<f32> = picture
-                .rgba
-                .chunks(4)
-                .flat_map(|pixel| [0, 1, 2].map(|c| f32::from(pixel[c]) / 255.0))
-                .collect();
-            let shown: Vec<f32> = rendered
-                .rgb
-                .iter()
-                .flatten()
-                .map(|c| c.clamp(0.0, 1.0))
-                .collect();
-            let (width, height) = (size.0 as usize, size.1 as usize);
-            views.push(Seen {
-                name: name.clone(),
-                psnr: eval::psnr(&shown, &photo),
-                ssim: eval::ssim(&shown, &photo, width, height, 3).unwrap_or(f64::NAN),
+    fn views(&mut self) -> anyhow::Result<Vec<Seen>> {
+        let run = self.args.out.join(RUN);
+        let mut pairs = Vec::new();
+        let scores = pictures::score(&run, None, None, self.context, &mut |rendered, picture| {
+            pairs.push((rendered, picture))
+        })?;
+        let seen = scores.views.into_iter().zip(pairs);
+        Ok(seen
+            .map(|(score, (rendered, picture))| Seen {
+                name: score.name,
+                psnr: score.psnr,
+                ssim: score.ssim.unwrap_or(f64::NAN),
                 picture,
                 rendered,
-            });
-        }
-        Ok(views)
+            })
+            .collect())
     }
 
     fn log(&self) -> Result<String> {
@@ -517,7 +406,7 @@ fn scores(
     dataset: &SyntheticDataset,
     scene: &Scene,
 ) -> anyhow::Result<GeometryScores> {
-    let reference = Reference::from_mesh(mesh::read_mesh(&dataset.reference)?);
+    let reference = Reference::from_mesh(read_mesh(&dataset.reference)?);
     let cameras: Vec<View> = scene
         .split(Split::Train)
         .map(|view| scene.views[view].clone())

@@ -2,6 +2,7 @@
 
 use super::{Global, LogFormat, VERSION, output};
 use crate::train::report::timestamp;
+use crate::{Error, Result};
 use serde_json::{Map, Value};
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
@@ -13,8 +14,12 @@ use tracing_subscriber::layer::{Context, SubscriberExt};
 use tracing_subscriber::util::SubscriberInitExt;
 use tracing_subscriber::{EnvFilter, Layer};
 
-/// Shows the library's trace: warnings, with -v what it does, with -vv how; RUST_LOG says otherwise.
-pub(super) fn install_log(global: &Global, colored: bool) {
+/// Shows the library's trace: warnings, with -v what it decides and touches, with -vv how, with -vvv what it does at every step;
+/// RUST_LOG says otherwise, but not against --quiet.
+///
+/// # Errors
+/// [`Error::Config`] for a RUST_LOG that is none.
+pub(super) fn install_log(global: &Global, colored: bool) -> Result<()> {
     let level = match (global.quiet, global.verbose) {
         (true, _) => "error",
         (false, 0) => "warn",
@@ -22,8 +27,15 @@ pub(super) fn install_log(global: &Global, colored: bool) {
         (false, 2) => "debug",
         (false, _) => "trace",
     };
-    let filter = EnvFilter::try_from_default_env()
-        .unwrap_or_else(|_| EnvFilter::new(format!("neurodin={level}")));
+    let asked = std::env::var(EnvFilter::DEFAULT_ENV).unwrap_or_default();
+    let filter = match global.quiet || asked.is_empty() {
+        true => EnvFilter::new(format!("neurodin={level}")),
+        false => EnvFilter::try_new(&asked).map_err(|error| Error::Config {
+            what: format!(
+                "RUST_LOG={asked}: {error}\n  next: for example RUST_LOG=info, or neurodin::gpu=debug"
+            ),
+        })?,
+    };
     let trace = Trace {
         json: global.log_format == LogFormat::Json,
         colored,
@@ -33,6 +45,7 @@ pub(super) fn install_log(global: &Global, colored: bool) {
         .with(filter)
         .with(trace)
         .try_init();
+    Ok(())
 }
 
 /// Writes trace events as lines on stderr.
@@ -85,9 +98,8 @@ impl<S: Subscriber> Layer<S> for Trace {
             let mut record = Map::new();
             record.insert("ts".into(), timestamp(SystemTime::now()).into());
             record.insert("level".into(), level.as_str().to_lowercase().into());
-            record.insert("event".into(), "trace".into());
+            record.insert("event".into(), message.into());
             record.insert("target".into(), event.metadata().target().into());
-            record.insert("text".into(), message.into());
             record.extend(fields.0);
             return output::line(&Value::from(record).to_string());
         }

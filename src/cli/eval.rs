@@ -1,6 +1,6 @@
 //! `neurodin eval`: how well a run renders held-out views, or how far a mesh is from the true surface.
 
-mod pictures;
+pub(super) mod pictures;
 pub mod protocol;
 
 use std::fmt::Write;
@@ -22,7 +22,7 @@ use crate::{Error, Result};
 use protocol::{Protocol, ProtocolArgs};
 
 /// Score a training run's pictures, or a mesh against the true surface
-#[derive(Args, Clone, Debug)]
+#[derive(Args, Clone, Debug, Default)]
 #[command(after_help = "Examples:
   neurodin eval run/
   neurodin eval --mesh mesh.ply --reference scan.ply --thresholds 0.005,0.01
@@ -62,15 +62,15 @@ pub struct EvalArgs {
     /// Leave out of the mesh what no training view of this dataset sees
     #[arg(long, value_name = "DATASET")]
     pub visible_from: Option<PathBuf>,
-    /// Views that must see a place
-    #[arg(long, value_name = "N", default_value_t = 1, requires = "visible_from", value_parser = clap::value_parser!(u32).range(1..))]
-    pub min_views: u32,
+    /// Views that must see a place [default: 1]
+    #[arg(long, value_name = "N", requires = "visible_from", value_parser = clap::value_parser!(u32).range(1..))]
+    pub min_views: Option<u32>,
     /// A place is hidden by what is nearer to the camera by more than this [default: 0.1 % of half the reference's diagonal]
     #[arg(long, value_name = "D", requires = "visible_from")]
     pub hidden_by: Option<f64>,
-    /// Points drawn on a mesh (--protocol plain)
-    #[arg(long, value_name = "N", default_value_t = 500_000)]
-    pub samples: usize,
+    /// Points drawn on a mesh (--protocol plain) [default: 500000]
+    #[arg(long, value_name = "N")]
+    pub samples: Option<usize>,
     /// Seed of the points
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub seed: u64,
@@ -79,17 +79,17 @@ pub struct EvalArgs {
 }
 
 pub(super) fn run(args: &EvalArgs, context: &Context) -> anyhow::Result<()> {
-    let (report, text) = score(args, context)?;
-    Ok(context.result(&report, &text)?)
-}
-
-/// Scores what `args` name: the report for programs, and the one for people.
-pub(super) fn score(args: &EvalArgs, context: &Context) -> anyhow::Result<(Value, String)> {
-    match (&args.run, &args.mesh) {
-        (Some(run), _) => pictures::score(run, args, context),
-        (None, Some(mesh)) => Ok(score_mesh(args, mesh)?),
+    let (report, text) = match (&args.run, &args.mesh) {
+        (Some(run), _) => {
+            let at_eval = args.appearance.map(Into::into);
+            let dataset = args.dataset.as_deref();
+            let scores = pictures::score(run, dataset, at_eval, context, &mut |_, _| {})?;
+            (scores.to_json(), scores.text())
+        }
+        (None, Some(mesh)) => score_mesh(args, mesh)?,
         (None, None) => unreachable!("clap requires one of them"),
-    }
+    };
+    Ok(context.result(&report, &text)?)
 }
 
 /// Scores `mesh` against its reference: the report for programs, and the one for people.
@@ -130,7 +130,7 @@ fn plain(
     })?;
     let size = 0.5 * (high - low).length();
     let options = GeometryOptions {
-        samples: args.samples,
+        samples: args.samples.unwrap_or(500_000),
         seed: args.seed,
         thresholds: match args.thresholds[..] {
             [] => [0.005, 0.01, 0.02].map(|share| share * size).to_vec(),
@@ -138,7 +138,7 @@ fn plain(
         },
         trim: args.trim.unwrap_or(0.05 * size),
         crop,
-        min_views: args.min_views,
+        min_views: args.min_views.unwrap_or(1),
         hidden_by: args.hidden_by.unwrap_or(1e-3 * size),
     };
     let views = args

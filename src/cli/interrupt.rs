@@ -1,6 +1,7 @@
 //! Ctrl-C: the first asks for an orderly end, the second ends at once.
 
 use super::output;
+use crate::{Error, Result};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
@@ -28,4 +29,15 @@ pub(super) fn flag(then: &'static str) -> anyhow::Result<Arc<AtomicBool>> {
         output::line(&format!("interrupted: {then}; once more stops at once"));
     })?;
     Ok(Arc::clone(HANDLER.get_or_init(|| flag)))
+}
+
+/// [`Error::Interrupted`], in these words, once an end was asked for.
+///
+/// # Errors
+/// That one.
+pub(super) fn stop_if(interrupted: &AtomicBool, what: &str) -> Result<()> {
+    match interrupted.load(Ordering::SeqCst) {
+        true => Err(Error::Interrupted { what: what.into() }),
+        false => Ok(()),
+    }
 }

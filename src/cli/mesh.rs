@@ -4,17 +4,18 @@ use super::progress::Progress;
 use super::{Context, interrupt, scene_args};
 use crate::Error;
 use crate::gpu::Gpu;
+use crate::mesh::extract::ExtractStats;
 use crate::mesh::{ExtractOptions, Field, Mesh, clean, extract, write};
 use crate::train::run_directory::RunDirectory;
 use crate::train::trained::Trained;
 use clap::{Args, ValueEnum};
 use glam::{DMat4, DVec3};
 use serde_json::{Value, json};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
 
 /// Take the triangle mesh out of a run
-#[derive(Args)]
+#[derive(Args, Default)]
 #[command(after_help = "\
 Example:
   neurodin mesh run -o mesh.ply
@@ -63,12 +64,62 @@ pub(super) enum Frame {
 const STEEPEST: f64 = 4.0;
 
 pub(super) fn run(args: &MeshArgs, context: &Context) -> anyhow::Result<()> {
-    let (result, text) = take(args, context)?;
-    Ok(context.result(&result, &text)?)
+    let written = take(args, context)?.ok_or_else(|| no_surface(&args.run))?;
+    Ok(context.result(&written.to_json(), &written.text())?)
 }
 
-/// Takes the mesh out as `args` say: what came of it, for programs and for people.
-pub(super) fn take(args: &MeshArgs, context: &Context) -> anyhow::Result<(Value, String)> {
+/// Said of a run that has learned no surface.
+pub(super) const NO_SURFACE: &str =
+    "the signed distance has no zero surface in the region (or the crop box)";
+
+/// The error of a run that has learned no surface, for those who cannot do without.
+pub(super) fn no_surface(run: &Path) -> Error {
+    Error::input(
+        run,
+        NO_SURFACE,
+        "look at the previews: train longer, or choose the region by --center and --radius (`neurodin inspect --preview` shows it)",
+    )
+}
+
+/// A mesh that was taken out of a run.
+pub(super) struct Written {
+    pub file: PathBuf,
+    pub mesh: Mesh,
+    stats: ExtractStats,
+    /// Side of a cell, in the mesh's units.
+    cell: f64,
+    /// Steps that the run was trained for.
+    step: u64,
+}
+
+impl Written {
+    fn to_json(&self) -> Value {
+        json!({
+            "mesh": self.file,
+            "vertices": self.mesh.positions.len(),
+            "faces": self.mesh.faces.len(),
+            "bounds": self.mesh.bounds().map(|corners| corners.map(|corner| corner.to_array())),
+            "cells": self.stats.cells,
+            "cell": self.cell,
+            "step": self.step,
+        })
+    }
+
+    pub fn text(&self) -> String {
+        format!(
+            "done     {}: {} vertices, {} faces",
+            self.file.display(),
+            self.mesh.positions.len(),
+            self.mesh.faces.len()
+        )
+    }
+}
+
+/// Takes the mesh out as `args` say; `None`, and no file, where there is no zero surface.
+///
+/// # Errors
+/// Those of reading the run and of writing the mesh; [`Error::Interrupted`] after Ctrl-C; whatever the device fails with.
+pub(super) fn take(args: &MeshArgs, context: &Context) -> anyhow::Result<Option<Written>> {
     let run = RunDirectory::open(&args.run)?;
     let out = args
         .out
@@ -84,7 +135,7 @@ pub(super) fn take(args: &MeshArgs, context: &Context) -> anyhow::Result<(Value,
         "run      {}, {} of {} steps, on {}",
         run.root().display(),
         trained.step,
-        trained.config.total_steps(),
+        trained.config().total_steps(),
         gpu.info().name
     ));
     let world_from_region = trained.region.world_from_region();
@@ -112,30 +163,16 @@ pub(super) fn take(args: &MeshArgs, context: &Context) -> anyhow::Result<(Value,
         clean::drop_small(&mut mesh, args.min_faces);
     }
     if mesh.faces.is_empty() {
-        return Err(Error::input(
-            run.root(),
-            "the signed distance has no zero surface in the region (or the crop box)",
-            "look at the previews: train longer, or choose the region by --center and --radius (`neurodin inspect --preview` shows it)",
-        )
-        .into());
+        return Ok(None);
     }
     write::write_mesh(&out, &mesh, args.force)?;
-    let result = json!({
-        "mesh": out,
-        "vertices": mesh.positions.len(),
-        "faces": mesh.faces.len(),
-        "bounds": mesh.bounds().map(|corners| corners.map(|corner| corner.to_array())),
-        "cells": stats.cells,
-        "cell": stats.step * out_from_region.x_axis.truncate().length(),
-        "step": trained.step,
-    });
-    let text = format!(
-        "done     {}: {} vertices, {} faces",
-        out.display(),
-        mesh.positions.len(),
-        mesh.faces.len()
-    );
-    Ok((result, text))
+    Ok(Some(Written {
+        file: out,
+        cell: stats.step * out_from_region.x_axis.truncate().length(),
+        step: trained.step,
+        mesh,
+        stats,
+    }))
 }
 
 /// The mesh in region coordinates, with normals and colours.
@@ -144,9 +181,9 @@ fn surface(
     trained: &Trained,
     options: &ExtractOptions,
     context: &Context,
-) -> anyhow::Result<(Mesh, extract::ExtractStats)> {
+) -> anyhow::Result<(Mesh, ExtractStats)> {
     let interrupted = interrupt::flag("stopping")?;
-    let mut field = Field::new(gpu, &trained.config, &trained.model, trained.annealed())?;
+    let mut field = Field::new(gpu, trained.config(), &trained.model, trained.annealed())?;
     let mut stage = None;
     let mut shown: Option<Progress> = None;
     let mut tell = |progress: extract::Progress| {

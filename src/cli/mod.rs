@@ -2,6 +2,7 @@
 
 mod bench;
 mod bias;
+mod chosen;
 mod compare;
 pub mod demo;
 mod devices;
@@ -11,6 +12,7 @@ mod inspect;
 mod interrupt;
 mod mesh;
 mod output;
+mod page;
 mod profile;
 mod progress;
 mod render;
@@ -90,7 +92,7 @@ struct Global {
     /// Nothing on stderr but errors
     #[arg(short, long, global = true, conflicts_with = "verbose")]
     quiet: bool,
-    /// More about what happens inside; twice for still more (or RUST_LOG)
+    /// Say what is decided and touched; twice, how; three times, at every step, too (RUST_LOG chooses among them)
     #[arg(short, long, global = true, action = ArgAction::Count)]
     verbose: u8,
     /// How stderr is written; json: one object a line
@@ -185,7 +187,9 @@ pub fn main() -> ExitCode {
         Color::Auto => colored_by_environment(),
     };
     let context = Context::new(&cli.global, colored);
-    diagnostics::install_log(&cli.global, colored);
+    if let Err(error) = diagnostics::install_log(&cli.global, colored) {
+        return context.fail(&error.into());
+    }
     // A panic has told its story in the hook; what is left is the exit code.
     let outcome = std::panic::catch_unwind(AssertUnwindSafe(|| cli.command.run(&context)));
     match outcome {

@@ -1,13 +1,13 @@
 //! `neurodin profile`: where the time of a training step goes, kernel by kernel.
 
+use super::Context;
+use super::chosen::{Chosen, gpu_options, open_scene};
+use super::interrupt::{self, stop_if};
 use super::progress::Progress;
 use super::scene_args::SceneArgs;
 use super::settings::SettingsArgs;
-use super::timing::{Until, time};
-use super::train::{configure, gpu_options, open_scene, region_wanted};
-use super::{Context, interrupt};
+use super::timing::{STOPPED, Until, time};
 use crate::gpu::{GpuOptions, Profile};
-use crate::scene::Region;
 use crate::train::Trainer;
 use crate::{Error, Result};
 use clap::Args;
@@ -15,7 +15,6 @@ use serde_json::{Value, json};
 use std::fs::File;
 use std::io::{BufWriter, Write as _};
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicBool, Ordering};
 
 /// Time every kernel of some training steps
 #[derive(Args)]
@@ -67,7 +66,7 @@ pub(super) fn run(args: &ProfileArgs, context: &Context) -> anyhow::Result<()> {
         ..args.settings.clone()
     };
     let scene = open_scene(&settings, &args.scene, &args.dataset)?;
-    let chosen = configure(&settings, &args.scene, &scene)?;
+    let chosen = Chosen::of(&settings, &args.scene, &scene)?;
     let config = chosen.config;
     let config = match args.settings.stage {
         Some(2) => config.second_stage().ok_or_else(|| Error::Config {
@@ -75,7 +74,6 @@ pub(super) fn run(args: &ProfileArgs, context: &Context) -> anyhow::Result<()> {
         })?,
         _ => config,
     };
-    let region = Region::estimate(&scene, &region_wanted(&args.scene, &config))?;
     let gpu = context.gpu_with(GpuOptions {
         profile: true,
         ..gpu_options(&config)
@@ -83,7 +81,7 @@ pub(super) fn run(args: &ProfileArgs, context: &Context) -> anyhow::Result<()> {
     context.say(&format!("preset   {}{}", config.preset, chosen.why));
     context.say(&format!("device   {}", gpu.info().name));
     let roofs = gpu.measure_roofs()?;
-    let mut trainer = Trainer::new(&gpu, &scene, &region, &config)?;
+    let mut trainer = Trainer::new(&gpu, &scene, &chosen.region, &config)?;
     let interrupted = interrupt::flag("stopping")?;
     let mut progress = Progress::new(context, "profile", config.first_step + args.warmup + steps);
     let timed = time(
@@ -93,7 +91,7 @@ pub(super) fn run(args: &ProfileArgs, context: &Context) -> anyhow::Result<()> {
         Until::Steps(steps),
         &mut |step| {
             progress.at(step, "");
-            stop_if(&interrupted)
+            stop_if(&interrupted, STOPPED)
         },
     )?;
     drop(progress);
@@ -110,16 +108,6 @@ pub(super) fn run(args: &ProfileArgs, context: &Context) -> anyhow::Result<()> {
         result.extend(times);
     }
     Ok(context.result(&result, &timed.text(&roofs))?)
-}
-
-/// [`Error::Interrupted`] once Ctrl-C was pressed.
-pub(super) fn stop_if(interrupted: &AtomicBool) -> Result<()> {
-    match interrupted.load(Ordering::SeqCst) {
-        true => Err(Error::Interrupted {
-            what: "stopped before all was timed".into(),
-        }),
-        false => Ok(()),
-    }
 }
 
 /// Chrome's trace format: one complete event ("X") a launch, in microseconds.

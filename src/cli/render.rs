@@ -106,16 +106,13 @@ pub(super) fn run(args: &RenderArgs, context: &Context) -> anyhow::Result<()> {
     let run = RunDirectory::open(&args.run)?;
     check_destination(&args.out, args.force)?;
     let gpu = context.gpu()?;
-    let mut trained = Trained::open(&gpu, &run)?;
-    if let Some(appearance) = args.appearance {
-        trained.config.appearance.at_eval = appearance.into();
-    }
+    let trained = Trained::open(&gpu, &run)?;
     for refused in &trained.refused {
         context.warn(&refused.to_string());
     }
     let mut scene = trained
         .record
-        .open(args.dataset.as_deref(), &trained.config)?;
+        .open(args.dataset.as_deref(), trained.config())?;
     let reduced = |size: u32| ((f64::from(size) / args.downscale).round() as u32).max(1);
     for view in &mut scene.views {
         view.camera = view
@@ -147,7 +144,8 @@ pub(super) fn run(args: &RenderArgs, context: &Context) -> anyhow::Result<()> {
         )
     })?;
     let names = file_names(&scene);
-    let viewer = trained.viewer(&scene)?;
+    let usual = trained.config().appearance.at_eval;
+    let viewer = trained.viewer(&scene, args.appearance.map_or(usual, Into::into))?;
     let interrupted = interrupt::flag("stopping after what is written")?;
     let pixels = |view: usize| {
         let camera = &scene.views[view].camera;

@@ -2,6 +2,7 @@
 
 use clap::Args;
 
+use crate::config::{Config, MaskUse, RegionKind};
 use crate::scene::{RegionOverrides, SceneOptions};
 
 /// How to read the dataset, and the region to reconstruct.
@@ -59,6 +60,36 @@ impl SceneArgs {
             scale: self.region_scale.unwrap_or(defaults.scale),
             prefer_box: defaults.prefer_box,
         }
+    }
+
+    /// What these flags and a configuration say of the region.
+    pub(super) fn region(&self, config: &Config) -> RegionOverrides {
+        self.overrides(&RegionOverrides {
+            scale: config.scene.region_scale,
+            prefer_box: config.scene.shape == RegionKind::Box,
+            ..RegionOverrides::default()
+        })
+    }
+
+    /// These flags' share of the settings, put into them.
+    ///
+    /// # Errors
+    /// [`crate::Error::Config`] for values that make no sense.
+    pub(super) fn put_into(&self, config: Config) -> crate::Result<Config> {
+        let mut config = config;
+        if let Some(downscale) = self.downscale {
+            config.scene.downscale = downscale;
+        }
+        if let Some(holdout) = self.holdout {
+            config.scene.holdout = holdout;
+        }
+        if let Some(scale) = self.region_scale {
+            config.scene.region_scale = scale;
+        }
+        if self.no_masks {
+            config.scene.masks = MaskUse::Ignore;
+        }
+        config.validated()
     }
 }
 

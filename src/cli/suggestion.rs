@@ -1,7 +1,6 @@
 //! Which preset a dataset asks for, by where its cameras look and what lies beyond the region; and whether another one fits.
 
 use super::scene_args::SceneArgs;
-use super::train::{region_wanted, with_scene_flags};
 use crate::Result;
 use crate::config::{BackgroundKind, Config};
 use crate::scene::{Beyond, Facing, Looks, Region, Scene, Split};
@@ -32,8 +31,8 @@ impl Suggestion {
     /// # Errors
     /// As [`Suggestion::of`] and [`Region::estimate`].
     pub fn for_scene(scene: &Scene, flags: &SceneArgs) -> Result<Suggestion> {
-        let config = with_scene_flags(flags, Config::preset("outdoor-tiny")?)?;
-        let region = Region::estimate(scene, &region_wanted(flags, &config))?;
+        let config = flags.put_into(Config::preset("outdoor-tiny")?)?;
+        let region = Region::estimate(scene, &flags.region(&config))?;
         Suggestion::of(scene, &region)
     }
 
@@ -102,7 +101,8 @@ impl Suggestion {
                 false => ("rooms", "inwards, as at an object or building"),
             };
             doubts.push(format!(
-                "{} is for {meant} (surface.inside_out = {}), but the cameras look {looks}: {}. It is used as asked; if the mesh is bad, try {}",
+                "{} is for {meant} (surface.inside_out = {}), but the cameras look {looks}: {}. It is used as asked; if the mesh is bad, \
+                 try {}",
                 config.preset,
                 config.surface.inside_out,
                 self.looks.why,
@@ -114,7 +114,8 @@ impl Suggestion {
             && config.background.kind != BackgroundKind::Field
         {
             doubts.push(format!(
-                "{why}, which one colour behind the region cannot explain: the surface may vanish over it; --set background.kind=field shows what lies beyond"
+                "{why}, which one colour behind the region cannot explain: the surface may vanish over it; \
+                 --set background.kind=field shows what lies beyond"
             ));
         }
         doubts
@@ -135,7 +136,8 @@ fn cameras_in_matter(config: &Config, scene: &Scene, region: &Region) -> Option<
     let free = config.surface.initial_radius();
     (farthest > free).then(|| {
         format!(
-            "cameras stand up to {farthest:.2} from the centre of the region (in its units), and space is free up to {free:.2} at first: fog around them is slow to go. A larger --region-scale, or --set surface.init_bias={:.1}, would hold them all",
+            "cameras stand up to {farthest:.2} from the centre of the region (in its units), and space is free up to {free:.2} at first: \
+             fog around them is slow to go. A larger --region-scale, or --set surface.init_bias={:.1}, would hold them all",
             (farthest / free * config.surface.init_bias * 10.0).ceil() / 10.0
         )
     })

@@ -8,6 +8,9 @@ use serde_json::{Value, json};
 use std::fmt::Write as _;
 use std::time::Instant;
 
+/// What is said of an interrupted measurement.
+pub(super) const STOPPED: &str = "stopped before all was timed";
+
 /// How many steps are timed.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Until {
@@ -120,7 +123,8 @@ impl Timed {
         let (steps, wall_ms, cpu_ms) = (self.steps as f64, self.wall_ms, self.cpu_ms);
         let _ = write!(
             text,
-            "{steps} steps: {:.2} ms each on the device, {:.2} ms on the clock ({:.1} % covered), {:.2} ms of CPU time; roofs {:.1} GB/s, {:.1} GFLOP/s",
+            "{steps} steps: {:.2} ms each on the device, {:.2} ms on the clock ({:.1} % covered), {:.2} ms of CPU time; \
+             roofs {:.1} GB/s, {:.1} GFLOP/s",
             total / steps,
             wall_ms / steps,
             100.0 * total / wall_ms,

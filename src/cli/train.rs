@@ -1,17 +1,17 @@
 //! `neurodin train`: a dataset becomes a run directory; or an interrupted run goes on.
 
+use super::chosen::{Chosen, described, gpu_options, open_scene};
 use super::progress::{Progress, clock};
 use super::scene_args::SceneArgs;
 use super::settings::SettingsArgs;
-use super::suggestion::Suggestion;
 use super::{Context, diagnostics, interrupt};
-use crate::config::{Config, Effect, MaskUse, RegionKind};
-use crate::gpu::{Gpu, GpuOptions};
-use crate::scene::{Region, RegionOverrides, RegionShape, Scene, Split};
+use crate::config::{Config, Effect};
+use crate::gpu::Gpu;
+use crate::scene::{Region, RegionShape, Scene, Split};
 use crate::train::Trainer;
 use crate::train::checkpoint::{self, Latest};
 use crate::train::report::{Control, Event, Log};
-use crate::train::run_directory::{RunDirectory, SceneRecord, scene_options};
+use crate::train::run_directory::{RunDirectory, SceneRecord};
 use crate::{Error, Result};
 use anyhow::Context as _;
 use clap::Args;
@@ -29,7 +29,8 @@ Example:
   neurodin train --out run --resume
   neurodin train --preset indoor-tiny --print-config > mine.toml")]
 pub(super) struct TrainArgs {
-    /// Directory of the dataset, its transforms.json, meta_data.json or cameras_sphere.npz, or the directory of a COLMAP model; with --resume only if it has moved
+    /// Directory of the dataset, its transforms.json, meta_data.json or cameras_sphere.npz, or the directory of a COLMAP model; with
+    /// --resume only if it has moved
     #[arg(required_unless_present_any = ["resume", "print_config"])]
     pub dataset: Option<PathBuf>,
     /// Run directory to write
@@ -72,18 +73,18 @@ pub(super) fn run(args: &TrainArgs, context: &Context) -> anyhow::Result<()> {
         context.say("dry run: nothing was written");
         return Ok(context.result(&json!({ "dry_run": true, "config": task.config }), "")?);
     }
-    let (result, text) = task.run(args.force, context)?;
-    Ok(context.result(&result, &text)?)
+    let done = task.run(args.force, context)?;
+    Ok(context.result(&done.to_json(), &done.text())?)
 }
 
-/// Trains on a dataset into `out`, or where a run of it is there already goes on with that; what it led to, for programs and for people.
+/// Trains on a dataset into `out`, or where a run of it is there already goes on with that.
 pub(super) fn train_or_resume(
     dataset: &Path,
     out: &Path,
     settings: SettingsArgs,
     scene: SceneArgs,
     context: &Context,
-) -> anyhow::Result<(Value, String)> {
+) -> anyhow::Result<Done> {
     let has_checkpoint = RunDirectory::open(out)
         .and_then(|run| checkpoint::latest(&run.checkpoints()))
         .is_ok();
@@ -112,83 +113,8 @@ pub(super) fn train_or_resume(
     task.run(true, context)
 }
 
-/// The scene flags' share of the settings.
-pub(super) fn with_scene_flags(args: &SceneArgs, config: Config) -> Result<Config> {
-    let mut config = config;
-    if let Some(downscale) = args.downscale {
-        config.scene.downscale = downscale;
-    }
-    if let Some(holdout) = args.holdout {
-        config.scene.holdout = holdout;
-    }
-    if let Some(scale) = args.region_scale {
-        config.scene.region_scale = scale;
-    }
-    if args.no_masks {
-        config.scene.masks = MaskUse::Ignore;
-    }
-    config.validated()
-}
-
-/// The settings for a new run, as far as they are known without looking at its dataset.
-fn described(settings: &SettingsArgs, scene: &SceneArgs) -> Result<Config> {
-    with_scene_flags(scene, settings.resolve(Config::preset("outdoor-tiny")?)?)
-}
-
-/// The settings for a new run on a dataset.
-pub(super) struct Chosen {
-    pub config: Config,
-    /// Why the preset was chosen, if it was not named.
-    pub why: String,
-    /// What speaks against it, if it was.
-    pub doubts: Vec<String>,
-}
-
-/// Chooses the settings: those that were asked for, on top of what the dataset suggests where no preset was named.
-pub(super) fn configure(
-    settings: &SettingsArgs,
-    flags: &SceneArgs,
-    scene: &Scene,
-) -> Result<Chosen> {
-    if settings.names_preset()? {
-        let config = described(settings, flags)?;
-        let region = Region::estimate(scene, &region_wanted(flags, &config))?;
-        return Ok(Chosen {
-            doubts: Suggestion::of(scene, &region)?.doubts(&config, scene, &region),
-            why: String::new(),
-            config,
-        });
-    }
-    let suggestion = Suggestion::for_scene(scene, flags)?;
-    let config = with_scene_flags(flags, settings.resolve(suggestion.config()?)?)?;
-    let region = Region::estimate(scene, &region_wanted(flags, &config))?;
-    Ok(Chosen {
-        why: suggestion.in_words(),
-        doubts: suggestion.doubts(&config, scene, &region),
-        config,
-    })
-}
-
-/// What flags and settings say of the region.
-pub(super) fn region_wanted(flags: &SceneArgs, config: &Config) -> RegionOverrides {
-    flags.overrides(&RegionOverrides {
-        scale: config.scene.region_scale,
-        prefer_box: config.scene.shape == RegionKind::Box,
-        ..RegionOverrides::default()
-    })
-}
-
-/// The dataset as the flags say it should be read; no preset says otherwise.
-pub(super) fn open_scene(
-    settings: &SettingsArgs,
-    flags: &SceneArgs,
-    dataset: &Path,
-) -> Result<Scene> {
-    Scene::open(dataset, &scene_options(&described(settings, flags)?))
-}
-
 /// Everything a run needs, on the device, with nothing written yet.
-struct Task {
+pub(super) struct Task {
     out: PathBuf,
     config: Config,
     scene: Scene,
@@ -196,6 +122,41 @@ struct Task {
     trainer: Trainer,
     /// The checkpoint that it goes on from.
     resumed: Option<PathBuf>,
+}
+
+/// What training came to.
+pub(super) struct Done {
+    run: PathBuf,
+    /// Steps done in all stages, also before it was resumed.
+    pub steps: u64,
+    took: Duration,
+    /// Device memory of the stage that took most.
+    pub device_bytes: u64,
+    /// Of the last preview, in dB.
+    preview_psnr: Option<f64>,
+    checkpoint: Option<PathBuf>,
+}
+
+impl Done {
+    fn to_json(&self) -> Value {
+        json!({
+            "run": self.run,
+            "step": self.steps,
+            "seconds": self.took.as_secs_f64(),
+            "device_bytes": self.device_bytes,
+            "preview_psnr": self.preview_psnr,
+            "checkpoint": self.checkpoint,
+        })
+    }
+
+    fn text(&self) -> String {
+        format!(
+            "done     {} steps in {}; next: neurodin mesh {} -o mesh.ply",
+            self.steps,
+            clock(self.took),
+            self.run.display()
+        )
+    }
 }
 
 /// A new run.
@@ -209,9 +170,12 @@ fn begin(args: &TrainArgs, out: &Path, context: &Context) -> anyhow::Result<Task
     RunDirectory::check_free(out, args.force)?;
     let dataset = args.dataset.as_deref().expect("clap requires it");
     let scene = open_scene(&args.settings, &args.scene, dataset)?;
-    let chosen = configure(&args.settings, &args.scene, &scene)?;
-    let config = chosen.config;
-    let region = Region::estimate(&scene, &region_wanted(&args.scene, &config))?;
+    let Chosen {
+        config,
+        region,
+        why,
+        doubts,
+    } = Chosen::of(&args.settings, &args.scene, &scene)?;
     context.say(&format!(
         "dataset  {}, {}: {} views to train on, {} held out{}",
         dataset.display(),
@@ -227,24 +191,17 @@ fn begin(args: &TrainArgs, out: &Path, context: &Context) -> anyhow::Result<Task
     context.say(&format!(
         "preset   {}{}, {}, seed {}",
         config.preset,
-        chosen.why,
+        why,
         in_stages(&config),
         config.seed
     ));
-    for doubt in &chosen.doubts {
+    for doubt in &doubts {
         context.warn(doubt);
     }
     let gpu = context.gpu_with(gpu_options(&config))?;
-    let trainer = Trainer::new(&gpu, &scene, &region, &config)?;
+    let task = Task::new(&gpu, dataset, scene, &region, config, out)?;
     say_device(&gpu, args.dry_run, context);
-    Ok(Task {
-        out: out.into(),
-        record: SceneRecord::new(dataset, &scene, &region)?,
-        config,
-        scene,
-        trainer,
-        resumed: None,
-    })
+    Ok(task)
 }
 
 /// The device, and what of its memory is used from here to the end: everything is allocated before the first step.
@@ -286,15 +243,6 @@ fn in_words(region: &Region) -> String {
     )
 }
 
-/// How a configuration wants its device to work.
-pub(super) fn gpu_options(config: &Config) -> GpuOptions {
-    GpuOptions {
-        deterministic: config.deterministic,
-        matrices: config.matrices,
-        ..GpuOptions::default()
-    }
-}
-
 /// A run that is gone on with.
 struct Resumed {
     run: RunDirectory,
@@ -322,7 +270,7 @@ fn resumed(args: &TrainArgs, out: &Path) -> Result<Resumed> {
     let config = args
         .settings
         .resolve(was)
-        .and_then(|config| with_scene_flags(&args.scene, config))?;
+        .and_then(|config| args.scene.put_into(config))?;
     Ok(Resumed {
         run,
         latest,
@@ -398,8 +346,33 @@ fn resume(args: &TrainArgs, out: &Path, context: &Context) -> anyhow::Result<Tas
 }
 
 impl Task {
-    /// To the end: what it led to, for programs and for people.
-    fn run(mut self, force: bool, context: &Context) -> anyhow::Result<(Value, String)> {
+    /// A new run into `out`, on a scene that was opened from `dataset`.
+    ///
+    /// # Errors
+    /// Those of [`Trainer::new`] and [`SceneRecord::new`].
+    pub fn new(
+        gpu: &Gpu,
+        dataset: &Path,
+        scene: Scene,
+        region: &Region,
+        config: Config,
+        out: &Path,
+    ) -> Result<Task> {
+        Ok(Task {
+            out: out.into(),
+            record: SceneRecord::new(dataset, &scene, region)?,
+            trainer: Trainer::new(gpu, &scene, region, &config)?,
+            config,
+            scene,
+            resumed: None,
+        })
+    }
+
+    /// To the end. `force` replaces a run that is there already.
+    ///
+    /// # Errors
+    /// [`Error::Interrupted`] after Ctrl-C, with a checkpoint saved; those of writing the run directory and of [`Trainer::run`].
+    pub fn run(mut self, force: bool, context: &Context) -> anyhow::Result<Done> {
         let run = match &self.resumed {
             Some(_) => RunDirectory::resume(&self.out)?,
             None => RunDirectory::create(&self.out, force)?,
@@ -452,22 +425,14 @@ impl Task {
             Some(path) => format!("the last checkpoint is {}", path.display()),
             None => "there is no checkpoint of this run yet".into(),
         })?;
-        let seconds = begun.elapsed();
-        let result = json!({
-            "run": run.root(),
-            "step": steps_done,
-            "seconds": seconds.as_secs_f64(),
-            "device_bytes": device_bytes,
-            "preview_psnr": psnr,
-            "checkpoint": checkpoint,
-        });
-        let text = format!(
-            "done     {} steps in {}; next: neurodin mesh {} -o mesh.ply",
-            steps_done,
-            clock(seconds),
-            run.root().display()
-        );
-        Ok((result, text))
+        Ok(Done {
+            run: run.root().into(),
+            steps: steps_done,
+            took: begun.elapsed(),
+            device_bytes,
+            preview_psnr: psnr,
+            checkpoint,
+        })
     }
 }
 

@@ -1,4 +1,5 @@
-//! Scores: how far a mesh is from the true surface ([`geometry`], and by the protocols of [`tanks`] and [`dtu`]), how far a rendered picture is from the photograph ([`images`]).
+//! Scores: how far a mesh is from the true surface ([`geometry`], and by the protocols of [`tanks`] and [`dtu`]), how far a rendered
+//! picture is from the photograph ([`images`]).
 
 pub mod cloud;
 pub mod dtu;

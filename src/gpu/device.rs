@@ -117,6 +117,7 @@ impl Gpu {
         let instance = Instance::new(options.validation)?;
         let devices = instance.devices()?;
         let chosen = choose(&devices, options.device.as_deref())?;
+        let offered = devices.len();
         let (physical, mut info) = devices.into_iter().nth(chosen).expect("chosen from these");
         if options.portable {
             info.float_atomics = false;
@@ -143,6 +144,18 @@ impl Gpu {
                 ),
             });
         }
+        tracing::info!(
+            device = info.name,
+            driver = info.driver,
+            kind = %info.kind,
+            index = info.index,
+            offered,
+            subgroup_size = info.subgroup_size,
+            few_cores = info.few_cores,
+            float_atomics = info.float_atomics,
+            matrix = ?info.matrix,
+            "device chosen"
+        );
         let context = Context::new(instance, physical, &info)?;
         let memory = Memory::new(&context, options.memory_limit)?;
         let pipelines = Pipelines::new(&context, &info, options)?;
@@ -153,8 +166,9 @@ impl Gpu {
         }
         let mut options = options.clone();
         options.autotune &= !options.deterministic;
-        let tuning_file =
-            (options.cache_dir.as_ref()).map(|dir| dir.join(tuning::file_name(&info)));
+        let tuning_file = (options.cache_dir.as_ref())
+            .filter(|_| options.autotune)
+            .map(|dir| dir.join(tuning::file_name(&info)));
         let inner = Inner {
             queue,
             pipelines,

@@ -57,7 +57,8 @@ pub struct DeviceInfo {
     /// Whether a handful of cores do all the work, as on software devices: kernels then keep them apart where a GPU's invocations would
     /// meet in memory, and go through memory in pieces that fit a core's cache.
     pub few_cores: bool,
-    /// (M, N, K) of the products of float16 matrices, M × K by K × N, with float32 sums that a subgroup makes; `None` where there are none, or where the device was opened without them ([`super::GpuOptions::matrices`]).
+    /// (M, N, K) of the products of float16 matrices, M × K by K × N, with float32 sums that a subgroup makes; `None` where there are
+    /// none, or where the device was opened without them ([`super::GpuOptions::matrices`]).
     pub matrix: Option<[u32; 3]>,
     /// What this device lacks to run the kernels; empty where it can.
     pub missing: Vec<String>,

@@ -9,6 +9,7 @@ use std::collections::HashMap;
 use std::marker::PhantomData;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
+use std::time::Instant;
 
 /// What build.rs found in a kernel's SPIR-V.
 #[derive(Debug)]
@@ -143,6 +144,12 @@ impl Pipelines {
             .and_then(|file| std::fs::read(file).ok())
             .filter(|data| is_for(data, info))
             .unwrap_or_default();
+        match &cache_file {
+            Some(file) => {
+                tracing::info!(file = %file.display(), bytes = known.len(), "pipeline cache opened")
+            }
+            None => tracing::info!("no pipeline cache"),
+        }
         let create = vk::PipelineCacheCreateInfo::default().initial_data(&known);
         // SAFETY: a live device; data with this device's header, which drivers check once more.
         let cache = unsafe { device.create_pipeline_cache(&create, None) }
@@ -185,8 +192,10 @@ impl Pipelines {
         let failed = |error| Error::io(file, error);
         std::fs::create_dir_all(folder).map_err(failed)?;
         let beside = file.with_extension(format!("{}.part", std::process::id()));
-        std::fs::write(&beside, data).map_err(failed)?;
-        std::fs::rename(&beside, file).map_err(failed)
+        std::fs::write(&beside, &data).map_err(failed)?;
+        std::fs::rename(&beside, file).map_err(failed)?;
+        tracing::info!(file = %file.display(), bytes = data.len(), "pipeline cache written");
+        Ok(())
     }
 
     fn build(
@@ -300,7 +309,9 @@ fn is_for(data: &[u8], info: &DeviceInfo) -> bool {
 impl Drop for Pipelines {
     fn drop(&mut self) {
         // A cache that cannot be written only costs time at the next start.
-        let _ = self.save();
+        if let Err(error) = self.save() {
+            tracing::info!(%error, "pipeline cache not written");
+        }
         // SAFETY: the last owner waited for all work.
         unsafe {
             self.device.destroy_pipeline_cache(self.cache, None);
@@ -347,8 +358,15 @@ impl Gpu {
             Some((pipeline, row)) => (*pipeline, row.clone()),
             None => {
                 let deterministic = self.deterministic();
+                let begun = Instant::now();
                 let pipeline =
                     pipelines.build(&self.inner.context, info, module, &key.1, deterministic)?;
+                tracing::debug!(
+                    kernel = module.name,
+                    constants = ?key.1,
+                    ms = 1e3 * begun.elapsed().as_secs_f64(),
+                    "pipeline built"
+                );
                 let row: Arc<str> = module.name.into();
                 built.insert(key, (pipeline, row.clone()));
                 (pipeline, row)

@@ -48,6 +48,7 @@ impl Slab {
             memory.check_fit(&inner.context, &inner.info, name, bytes)?;
         }
         let parts = memory.allocate(&inner.context, name, bytes, location)?;
+        tracing::debug!(buffer = name, bytes, on_device, "buffer made");
         let id = memory.next_id.fetch_add(1, Ordering::Relaxed);
         let (address, size) = (parts.address, parts.size);
         let slab = Arc::new(Slab {

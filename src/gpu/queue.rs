@@ -265,11 +265,17 @@ impl Gpu {
             .take(self.inner.device(), &mut slot.stamps)?;
 
         queue.begin();
+        let before = state.submitted;
         let mut recorder = Recorder::new(self, &mut state, name);
         let recorded = record(&mut recorder);
         let finished = recorder.finish(recorded);
         queue.end(state.submitted);
         finished?;
+        // (Of every step: the finest level.)
+        let submissions = state.submitted - before;
+        if submissions > 1 {
+            tracing::trace!(name, submissions, "work cut");
+        }
         Ok(Ticket(state.submitted))
     }
 

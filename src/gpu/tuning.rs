@@ -50,9 +50,13 @@ impl Tuning {
         let answers = text
             .and_then(|text| serde_json::from_str(&text).ok())
             .filter(|kept: &Kept| kept.kernels == kernels_at_hand())
-            .map(|kept| kept.answers);
+            .map(|kept| kept.answers)
+            .unwrap_or_default();
+        if let Some(file) = &file {
+            tracing::info!(file = %file.display(), ?answers, "tuning answers taken");
+        }
         Tuning {
-            answers: Mutex::new(answers.unwrap_or_default()),
+            answers: Mutex::new(answers),
             file,
         }
     }
@@ -111,15 +115,20 @@ impl Gpu {
         }
         let prepared = prepare()?;
         let mut seconds = Vec::new();
-        for way in 0..ways.len() {
-            seconds.push(self.seconds_of(|rec| run(&prepared, way, rec))?);
+        for (way, name) in ways.iter().enumerate() {
+            let of_this = self.seconds_of(|rec| run(&prepared, way, rec))?;
+            tracing::debug!(question, way = name, ms = 1e3 * of_this, "way measured");
+            seconds.push(of_this);
         }
         let fastest = (0..ways.len()).min_by(|&a, &b| seconds[a].total_cmp(&seconds[b]));
         let better = fastest.filter(|&way| seconds[way] < WORTH * seconds[0]);
         let chosen = better.unwrap_or(0);
+        tracing::info!(question, way = ways[chosen], "tuning answer measured");
         answers.insert(question.into(), ways[chosen].clone());
         // An answer that cannot be kept costs time at the next start, and nothing else.
-        let _ = tuning.save(&answers);
+        if let Err(error) = tuning.save(&answers) {
+            tracing::info!(%error, "tuning answers not written");
+        }
         Ok(chosen)
     }
 }

@@ -200,6 +200,17 @@ pub fn extract_surface(
     }
     let mut mesh = sink.mesh;
     super::clean::drop_unused_vertices(&mut mesh);
+    tracing::info!(
+        cells = ?stats.cells,
+        blocks = stats.blocks,
+        outside = stats.blocks_outside,
+        skipped = stats.blocks_skipped,
+        steepest = stats.steepest,
+        scratch_bytes = stats.scratch_bytes,
+        vertices = mesh.positions.len(),
+        faces = mesh.faces.len(),
+        "surface extracted"
+    );
     Ok((mesh, stats))
 }
 

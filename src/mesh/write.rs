@@ -126,6 +126,12 @@ pub fn write_mesh(path: &Path, mesh: &Mesh, force: bool) -> Result<()> {
             failed(e.error)
         }
     })?;
+    tracing::info!(
+        file = %path.display(),
+        vertices = mesh.positions.len(),
+        faces = mesh.faces.len(),
+        "mesh written"
+    );
     // The name itself reaches the disk with its folder; not every system can sync one, and the file is complete either way.
     let _ = File::open(folder(path)).and_then(|folder| folder.sync_all());
     Ok(())

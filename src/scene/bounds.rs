@@ -162,6 +162,13 @@ impl Region {
                 "give one with --center x,y,z --radius r",
             ));
         }
+        tracing::info!(
+            center = ?region.center.to_array(),
+            radius = region.radius,
+            shape = ?region.shape,
+            how = region.how,
+            "region chosen"
+        );
         Ok(region)
     }
 

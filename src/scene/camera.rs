@@ -309,6 +309,14 @@ impl Camera {
         }
     }
 
+    /// The same lens over an image of at most so many pixels, in proportion; over as many as now where those are no more.
+    pub fn within(&self, pixels: u64) -> Camera {
+        let now = f64::from(self.width) * f64::from(self.height);
+        let factor = (pixels as f64 / now).sqrt().min(1.0);
+        let reduced = |size: u32| ((f64::from(size) * factor) as u32).max(1);
+        self.scaled(reduced(self.width), reduced(self.height))
+    }
+
     /// The parameters as kernels take them: twelve floats, zeros behind the last.
     pub fn params_f32(&self) -> [f32; 12] {
         let mut padded = [0.0; 12];

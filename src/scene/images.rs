@@ -21,6 +21,16 @@ pub struct Picture {
     pub rgba: Vec<u8>,
 }
 
+impl Picture {
+    /// Its colours alone, in [0, 1]: `[height, width, 3]`.
+    pub fn rgb(&self) -> Vec<f32> {
+        self.rgba
+            .chunks_exact(4)
+            .flat_map(|pixel| [0, 1, 2].map(|c| f32::from(pixel[c]) / 255.0))
+            .collect()
+    }
+}
+
 /// What a picture's header says.
 pub(super) struct Header {
     /// As stored, EXIF orientation not applied.

@@ -324,6 +324,17 @@ impl Scene {
             hold_out(&mut scene, options.holdout);
         }
         check_enough_views(&scene, &reading.file)?;
+        tracing::info!(
+            format = %scene.format,
+            file = %reading.file.display(),
+            train = scene.split(Split::Train).count(),
+            test = scene.split(Split::Test).count(),
+            masks = scene.views.iter().filter(|view| view.mask_path.is_some()).count(),
+            points = scene.points.len(),
+            skipped = scene.skipped.len(),
+            downscale = options.downscale,
+            "dataset opened"
+        );
         Ok(scene)
     }
 

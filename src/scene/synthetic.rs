@@ -20,7 +20,7 @@ mod paint;
 mod shapes;
 mod tracing;
 
-pub use tracing::{Hit, SKY, encode_srgb, normal, radiance, sdf, trace};
+pub use tracing::{Hit, SKY, SUN, encode_srgb, normal, radiance, sdf, trace};
 
 /// Centre of the sphere that holds the scene, and its radius: what `sphere_center` and `sphere_radius` say in the dataset.
 pub const CENTER: DVec3 = dvec3(0.0, 0.0, 0.40);

@@ -128,6 +128,13 @@ pub fn save(
     }
     written?;
     sync_folder(folder).map_err(|error| failed(total, error))?;
+    tracing::info!(
+        file = %path.display(),
+        step = state.step,
+        tensors = tensors.len(),
+        bytes = total,
+        "checkpoint written"
+    );
     prune(folder, state.step, keep)?;
     Ok(path)
 }

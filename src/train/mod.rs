@@ -2,6 +2,7 @@
 
 mod adam;
 pub mod checkpoint;
+mod preview;
 pub mod report;
 mod run;
 pub mod run_directory;
@@ -17,6 +18,7 @@ use crate::render::{Annealed, Loss, Priors, Rendered, Renderer, Shot, TERMS, TRA
 use crate::scene::{Camera, ObjectMasks, Region, Scene, Split};
 use crate::{Error, Result};
 use adam::Adam;
+use preview::PreviewView;
 use schedule::{Now, Schedule};
 
 /// Trains a model on a scene: [`Trainer::step`] is one optimiser step.
@@ -34,7 +36,7 @@ pub struct Trainer {
     /// Indices into the scene's views in the order of the device's table: training views, then held-out ones.
     view_order: Vec<usize>,
     /// What a preview shows; the last row of the device's table.
-    preview: Option<run::PreviewView>,
+    preview: Option<PreviewView>,
     step: u64,
     /// On all learning rates: 1, or less once losses were not finite.
     rate_factor: f64,
@@ -97,7 +99,7 @@ impl Trainer {
         }
         let training: Vec<usize> = scene.split(Split::Train).collect();
         let held_out: Vec<usize> = scene.split(Split::Test).collect();
-        let preview = run::PreviewView::choose(scene, config);
+        let preview = PreviewView::choose(scene, config);
         let mut others: Vec<(Camera, DMat4)> = held_out
             .iter()
             .map(|&v| {

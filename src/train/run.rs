@@ -6,12 +6,9 @@ use super::run_directory::RunDirectory;
 use super::{StepLosses, Trainer};
 use crate::config::Config;
 use crate::gpu::Buffer;
-use crate::render::{Rendered, TERMS};
-use crate::scene::{Camera, Scene, Split};
+use crate::render::TERMS;
+use crate::scene::{Scene, Split};
 use crate::{Error, Result};
-use glam::DMat4;
-use image::imageops::{self, FilterType};
-use image::{RgbImage, RgbaImage};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -333,106 +330,11 @@ impl Trainer {
             })
             .collect()
     }
-
-    /// Writes a preview: photograph, rendering and normals side by side. Returns the rendering's PSNR, or `None` if there is no view.
-    fn look(
-        &self,
-        scene: &Scene,
-        path: &Path,
-        stop: &mut dyn FnMut() -> bool,
-    ) -> Result<Option<f64>> {
-        let Some(preview) = &self.preview else {
-            return Ok(None);
-        };
-        let (width, height) = (preview.camera.width, preview.camera.height);
-        let row = self.view_order.len() as u32;
-        let appearance = self.views.n_training();
-        let rendered = self.render_row(row, (width, height), appearance, &mut |_| !stop())?;
-        let picture = scene.load_picture(preview.view)?;
-        let photo = RgbaImage::from_raw(picture.width, picture.height, picture.rgba)
-            .expect("a picture has four bytes a pixel");
-        let photo = imageops::resize(&photo, width, height, FilterType::Triangle);
-        let psnr = psnr(&rendered, &photo);
-        side_by_side(&rendered, &photo)
-            .save(path)
-            .map_err(|error| {
-                Error::output(
-                    path,
-                    format!("cannot write this preview: {error}"),
-                    "make room or mend the permissions there, then go on with --resume",
-                )
-            })?;
-        Ok(Some(psnr))
-    }
 }
 
 /// Whether something that happens every `interval` steps (0: never) happens after this one, or `at_last` at the end.
 fn due(step: u64, interval: u64, at_last: bool) -> bool {
     interval > 0 && (step.is_multiple_of(interval) || at_last)
-}
-
-/// The view that previews show, with a camera of their size.
-pub(super) struct PreviewView {
-    pub view: usize,
-    pub camera: Camera,
-    pub world_from_camera: DMat4,
-}
-
-impl PreviewView {
-    /// The middle one of the held-out views, or of all where none is held out; `None` if previews are off.
-    pub fn choose(scene: &Scene, config: &Config) -> Option<PreviewView> {
-        if config.report.preview_steps == 0 {
-            return None;
-        }
-        let held_out: Vec<usize> = scene.split(Split::Test).collect();
-        let view = match held_out.len() {
-            0 => scene.views.len() / 2,
-            count => held_out[count / 2],
-        };
-        let from = scene.views.get(view)?;
-        let pixels = f64::from(from.camera.width) * f64::from(from.camera.height);
-        let scale = (config.report.preview_pixels as f64 / pixels)
-            .sqrt()
-            .min(1.0);
-        let reduced = |size: u32| ((f64::from(size) * scale).floor() as u32).max(1);
-        Some(PreviewView {
-            view,
-            camera: from
-                .camera
-                .scaled(reduced(from.camera.width), reduced(from.camera.height)),
-            world_from_camera: from.world_from_camera,
-        })
-    }
-}
-
-/// 8-bit value of a number in [0, 1].
-fn byte(value: f32) -> u8 {
-    (value.clamp(0.0, 1.0) * 255.0).round() as u8
-}
-
-fn psnr(rendered: &Rendered, photo: &RgbaImage) -> f64 {
-    let squares: f64 = rendered
-        .rgb
-        .iter()
-        .zip(photo.pixels())
-        .flat_map(|(ours, theirs)| {
-            (0..3).map(|c| f64::from(ours[c].clamp(0.0, 1.0)) - f64::from(theirs[c]) / 255.0)
-        })
-        .map(|difference| difference * difference)
-        .sum();
-    -10.0 * (squares / (3 * rendered.rgb.len()) as f64).log10()
-}
-
-fn side_by_side(rendered: &Rendered, photo: &RgbaImage) -> RgbImage {
-    let (width, height) = (rendered.width, rendered.height);
-    RgbImage::from_fn(3 * width, height, |x, y| {
-        let at = (y * width + x % width) as usize;
-        image::Rgb(match x / width {
-            0 => [0, 1, 2].map(|c| photo[(x, y)][c]),
-            1 => rendered.rgb[at].map(byte),
-            _ => rendered.normal[at].map(|n| byte(0.5 + 0.5 * n)),
-        })
-    })
 }
 
 /// A finished step's losses as an event.

@@ -13,8 +13,8 @@ use std::path::PathBuf;
 
 /// What a run has learned.
 pub struct Trained {
-    pub gpu: Gpu,
-    pub config: Config,
+    gpu: Gpu,
+    config: Config,
     pub region: Region,
     pub record: SceneRecord,
     pub model: Model,
@@ -69,12 +69,17 @@ impl Trained {
         super::annealed(&Schedule::new(&self.config).at(self.step))
     }
 
-    /// Everything that rendering the views of `scene` needs, on the device.
+    /// The settings that it was trained with.
+    pub fn config(&self) -> &Config {
+        &self.config
+    }
+
+    /// Everything that rendering the views of `scene` needs, on the device; with which appearance code, says `at_eval`.
     ///
     /// # Errors
     /// What the device fails with.
-    pub fn viewer<'t>(&'t self, scene: &Scene) -> Result<Viewer<'t>> {
-        self.viewer_with(scene, &self.config)
+    pub fn viewer<'t>(&'t self, scene: &Scene, at_eval: AppearanceAtEval) -> Result<Viewer<'t>> {
+        self.viewer_with(scene, &self.config, at_eval)
     }
 
     /// The same with other numbers of rays and shading samples than in training.
@@ -85,11 +90,16 @@ impl Trained {
         let mut config = self.config.clone();
         config.rays = rays;
         config.sampling.samples = samples;
-        self.viewer_with(scene, &config)
+        self.viewer_with(scene, &config, config.appearance.at_eval)
     }
 
-    fn viewer_with<'t>(&'t self, scene: &Scene, config: &Config) -> Result<Viewer<'t>> {
-        let mean = self.config.appearance.at_eval == AppearanceAtEval::Mean;
+    fn viewer_with<'t>(
+        &'t self,
+        scene: &Scene,
+        config: &Config,
+        at_eval: AppearanceAtEval,
+    ) -> Result<Viewer<'t>> {
+        let mean = at_eval == AppearanceAtEval::Mean;
         self.model.set_evaluation_code(&self.gpu, mean)?;
         let cameras: Vec<_> = scene
             .views
@@ -109,6 +119,7 @@ impl Trained {
             .collect();
         Ok(Viewer {
             trained: self,
+            at_eval,
             renderer: Renderer::new(&self.gpu, config, &self.model, &self.region, config.rays)?,
             views: ViewTable::new(&self.gpu, &self.region, std::iter::empty(), cameras.iter())?,
             codes,
@@ -119,6 +130,7 @@ impl Trained {
 /// Renders a scene's views with what a run has learned.
 pub struct Viewer<'t> {
     trained: &'t Trained,
+    at_eval: AppearanceAtEval,
     renderer: Renderer,
     views: ViewTable,
     /// Row of each view's own appearance code; `None` for views that were not trained with.
@@ -159,10 +171,9 @@ impl Viewer<'_> {
     }
 
     fn shot(&self, scene: &Scene, view: usize) -> Shot<'_> {
-        let Trained { config, model, .. } = self.trained;
-        let appearance_row = match (config.appearance.at_eval, self.codes[view]) {
+        let appearance_row = match (self.at_eval, self.codes[view]) {
             (AppearanceAtEval::Frame, Some(own)) => own,
-            _ => model.n_views,
+            _ => self.trained.model.n_views,
         };
         let camera = &scene.views[view].camera;
         Shot {

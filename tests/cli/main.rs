@@ -1,6 +1,8 @@
 //! The command line from outside: streams, exit codes, messages, and one small run from photographs to mesh.
 
+mod demo;
 mod studies;
+mod trace;
 
 use serde_json::Value;
 use std::f64::consts::TAU;
@@ -138,7 +140,7 @@ fn help_shows_examples_and_exit_codes() {
     }
     for command in [
         "devices", "inspect", "train", "mesh", "render", "eval", "profile", "bench", "compare",
-        "bias",
+        "bias", "demo",
     ] {
         assert!(
             help.stdout.contains(&format!("  {command} ")),

@@ -233,6 +233,25 @@ fn with_coefficients(model: CameraModel, coefficients: &[f64]) -> Camera {
     Camera::new(model, 640, 480, params).unwrap()
 }
 
+#[test]
+fn a_camera_is_reduced_to_so_many_pixels_and_never_enlarged() {
+    let camera = &cameras()[0];
+    for (pixels, size) in [
+        (1 << 20, (640, 480)),
+        (640 * 480, (640, 480)),
+        (15_000, (141, 106)),
+        (1, (1, 1)),
+    ] {
+        let reduced = camera.within(pixels);
+        assert_eq!((reduced.width, reduced.height), size, "{pixels}");
+    }
+    // What was seen in the middle still is.
+    let at = DVec2::new(322.0, 239.0);
+    let moved = at * DVec2::new(141.0 / 640.0, 106.0 / 480.0);
+    let (before, after) = (camera.direction(at), camera.within(15_000).direction(moved));
+    assert!(before.angle_between(after) < 1e-9);
+}
+
 proptest! {
     #![proptest_config(ProptestConfig { failure_persistence: None, ..ProptestConfig::default() })]
 

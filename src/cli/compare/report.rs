@@ -1,22 +1,16 @@
 //! The comparison as one HTML file that needs nothing else.
 
-use super::super::demo::chart::escape;
-use super::super::demo::report::{STYLE, image};
 use super::Shown;
 use super::table::Table;
+use crate::cli::page::{self, image};
+use crate::picture::chart::escape;
 use std::fmt::Write;
 
 /// The page: the table with the best of every column set off, and every mesh from one view.
 pub(super) fn html(table: &Table, pictures: &[Shown], dataset: &str) -> String {
-    let mut page = format!(
-        "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">\
-         <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\
-         <title>Comparison</title><style>{STYLE}</style></head><body><main>\
-         <header><h1>Comparison</h1><p class=\"lead\">{}</p></header><section><table><tr><th>method</th>",
-        escape(&format!(
-            "Equal budgets on {dataset}; mean ± standard deviation over seeds."
-        ))
-    );
+    let lead = format!("Equal budgets on {dataset}; mean ± standard deviation over seeds.");
+    let mut page = page::begin("Comparison", &lead);
+    page.push_str("</header><section><table><tr><th>method</th>");
     let columns = table.columns();
     for column in &columns {
         let _ = write!(page, "<th>{}</th>", escape(&column.head));
@@ -55,6 +49,7 @@ pub(super) fn html(table: &Table, pictures: &[Shown], dataset: &str) -> String {
             escape(&shown.name)
         );
     }
-    page.push_str("</div></section></main></body></html>\n");
+    page.push_str("</div></section>");
+    page.push_str(page::END);
     page
 }

@@ -1,14 +1,12 @@
 //! The demo's report: one HTML file that holds its style, its pictures (PNG, base64) and its charts (SVG), and needs nothing else.
 //!
-//! The input is plain data, so that a report can be made of anything. Colour of depth: [`depth_picture`]; of normals:
-//! [`normal_picture`].
+//! The input is plain data, so that a report can be made of anything.
 
 use std::fmt::Write;
 
-use base64::Engine;
-
-use super::chart::{Chart, escape, grouped, short};
-use super::mesh_picture::Rgb;
+use crate::cli::page::{self, image};
+use crate::picture::Rgb;
+use crate::picture::chart::{Chart, escape, grouped, short};
 
 /// Everything that the report shows.
 #[derive(Clone, Debug, Default)]
@@ -90,19 +88,10 @@ pub struct KernelRow {
     pub gbytes: Option<f64>,
 }
 
-pub const STYLE: &str = include_str!("report.css");
-
 impl Report {
     /// The page.
     pub fn html(&self) -> String {
-        let mut page = format!(
-            "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">\
-             <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\
-             <title>{title}</title><style>{STYLE}</style></head><body><main>\
-             <header><h1>{title}</h1><p class=\"lead\">{}</p>",
-            escape(&self.summary),
-            title = escape(&self.title),
-        );
+        let mut page = page::begin(&self.title, &self.summary);
         if !self.facts.is_empty() {
             page.push_str("<dl class=\"facts\">");
             for (name, value) in &self.facts {
@@ -134,7 +123,7 @@ impl Report {
         self.scores(&mut page);
         self.times(&mut page);
         self.settings(&mut page);
-        page.push_str("</main></body></html>\n");
+        page.push_str(page::END);
         page
     }
 
@@ -384,95 +373,5 @@ pub fn duration(seconds: f64) -> String {
     } else {
         let whole = seconds.round() as u64;
         format!("{} min {:02} s", whole / 60, whole % 60)
-    }
-}
-
-/// An `<img>` that carries its PNG.
-/// The picture within the page itself.
-pub fn image(picture: &Rgb, description: &str) -> String {
-    format!(
-        "<img width=\"{}\" height=\"{}\" alt=\"{}\" src=\"data:image/png;base64,{}\">",
-        picture.width,
-        picture.height,
-        escape(description),
-        base64::engine::general_purpose::STANDARD.encode(picture.png())
-    )
-}
-
-impl Rgb {
-    /// The picture as a PNG file.
-    pub fn png(&self) -> Vec<u8> {
-        use image::ImageEncoder;
-        assert_eq!(
-            self.bytes.len(),
-            3 * self.width * self.height,
-            "an RGB picture has three bytes a pixel"
-        );
-        let mut file = Vec::new();
-        image::codecs::png::PngEncoder::new_with_quality(
-            &mut file,
-            image::codecs::png::CompressionType::Best,
-            image::codecs::png::FilterType::Adaptive,
-        )
-        .write_image(
-            &self.bytes,
-            self.width as u32,
-            self.height as u32,
-            image::ExtendedColorType::Rgb8,
-        )
-        .expect("a PNG of matching size is written to memory");
-        file
-    }
-}
-
-/// Depths in colour: from `near` (yellow) to `far` (dark blue), lightness falling all the way; white where not finite or beyond.
-pub fn depth_picture(width: usize, height: usize, depth: &[f32], near: f32, far: f32) -> Rgb {
-    // Anchors of the ramp, sRGB.
-    const RAMP: [[f32; 3]; 6] = [
-        [252.0, 240.0, 150.0],
-        [245.0, 178.0, 85.0],
-        [218.0, 103.0, 92.0],
-        [148.0, 56.0, 124.0],
-        [72.0, 40.0, 118.0],
-        [20.0, 22.0, 66.0],
-    ];
-    assert_eq!(depth.len(), width * height, "one depth a pixel");
-    let mut bytes = Vec::with_capacity(3 * depth.len());
-    for value in depth {
-        if !value.is_finite() || *value > far {
-            bytes.extend([255; 3]);
-            continue;
-        }
-        let position = ((value - near) / (far - near)).clamp(0.0, 1.0) * (RAMP.len() - 1) as f32;
-        let below = (position as usize).min(RAMP.len() - 2);
-        let part = position - below as f32;
-        for (low, high) in RAMP[below].into_iter().zip(RAMP[below + 1]) {
-            bytes.push((low + (high - low) * part).round() as u8);
-        }
-    }
-    Rgb {
-        width,
-        height,
-        bytes,
-    }
-}
-
-/// Unit vectors in colour: each component from [-1, 1] to a byte; white where the vector is zero.
-pub fn normal_picture(width: usize, height: usize, normal: &[[f32; 3]]) -> Rgb {
-    assert_eq!(normal.len(), width * height, "one normal a pixel");
-    let bytes = normal
-        .iter()
-        .flat_map(|n| {
-            if *n == [0.0; 3] {
-                [255; 3]
-            } else {
-                n.map(|component| (127.5 + 127.5 * component.clamp(-1.0, 1.0)).round() as u8)
-            }
-        })
-        .collect();
-    Rgb {
-        width,
-        height,
-        bytes,
     }
 }

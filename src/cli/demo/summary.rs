@@ -5,11 +5,12 @@ use std::path::Path;
 use glam::{DVec3, dvec3};
 use serde_json::{Map, Value, json};
 
-use super::chart::{Chart, Series, grouped, short};
-use super::mesh_picture::{Eye, Lens, Rgb, Visible, clay, colors, sun_eye};
-use super::report::{Headline, KernelRow, Report, Threshold, depth_picture, normal_picture};
-use super::{Outcome, Seen, TIMED, report};
+use super::report::{Headline, KernelRow, Report, Threshold};
+use super::{Outcome, Seen, report};
 use crate::mesh::Mesh;
+use crate::picture::chart::{Chart, Series, grouped, short};
+use crate::picture::surface::{Eye, Lens, Visible, clay, colors, sun_eye};
+use crate::picture::{Rgb, depth_picture, normal_picture};
 use crate::scene::synthetic::{CENTER, RADIUS, look};
 
 /// Sides from which the mesh is shown: azimuth and elevation in degrees.
@@ -89,7 +90,7 @@ fn mean_ssim(outcome: &Outcome) -> f64 {
 /// The scores and what they were reached with.
 pub(super) fn as_json(outcome: &Outcome, seconds: f64) -> Value {
     json!({
-        "device": outcome.device,
+        "device": outcome.device.name,
         "preset": outcome.config.preset,
         "steps": outcome.config.steps,
         "seed": outcome.config.seed,
@@ -157,8 +158,8 @@ pub(super) fn report(outcome: &Outcome, pictures: Pictures, seconds: f64, out: &
                   this machine: NeuRodin's first stage in Vulkan compute kernels. Every number here was measured in this run."
             .into(),
         facts: vec![
-            ("device".into(), outcome.device.clone()),
-            ("driver".into(), outcome.driver.clone()),
+            ("device".into(), outcome.device.name.clone()),
+            ("driver".into(), outcome.device.driver.clone()),
             ("preset".into(), config.preset.clone()),
             ("steps".into(), grouped(config.steps as i64)),
             ("neurodin".into(), env!("CARGO_PKG_VERSION").into()),
@@ -195,8 +196,9 @@ pub(super) fn report(outcome: &Outcome, pictures: Pictures, seconds: f64, out: &
         stages: outcome.stages.clone(),
         kernels: kernels(outcome),
         kernel_note: format!(
-            "Device timestamps over {TIMED} steps after warm-up; together they cover {:.1} % of these steps' time.",
-            100.0 * outcome.coverage
+            "Device timestamps over {} steps after warm-up; together they cover {:.1} % of these steps' time.",
+            outcome.timed.steps,
+            100.0 * outcome.timed.device_ms() / outcome.timed.wall_ms
         ),
         settings: config.to_toml(),
         files: vec![
@@ -389,10 +391,11 @@ fn scores(outcome: &Outcome) -> Vec<(String, String, String)> {
 }
 
 fn kernels(outcome: &Outcome) -> Vec<KernelRow> {
-    let total: f64 = outcome.profile.rows.iter().map(|row| row.total_ms).sum();
+    let total = outcome.timed.device_ms();
     // 10⁹ units a second, where the kernel says how much it does.
     let rate = |units: f64, ms: f64| (units > 0.0 && ms > 0.0).then(|| units / ms * 1e-6);
     outcome
+        .timed
         .profile
         .rows
         .iter()

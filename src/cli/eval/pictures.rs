@@ -1,9 +1,9 @@
 //! The picture half of `neurodin eval`: PSNR and SSIM of a run's held-out views.
 
-use super::EvalArgs;
 use crate::Error;
 use crate::cli::progress::Progress;
 use crate::cli::{Context, interrupt};
+use crate::config::AppearanceAtEval;
 use crate::eval::images::{psnr, ssim};
 use crate::render::Rendered;
 use crate::scene::{Picture, Split};
@@ -11,30 +11,97 @@ use crate::train::run_directory::RunDirectory;
 use crate::train::trained::Trained;
 use serde_json::{Value, json};
 use std::fmt::Write;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
 
-/// Renders the held-out views of a run and compares them with their photographs: the report for programs, and the one for people.
+/// How well a run renders its held-out views.
+pub(in crate::cli) struct PictureScores {
+    run: PathBuf,
+    step: u64,
+    appearance: AppearanceAtEval,
+    pub views: Vec<ViewScore>,
+}
+
+/// How alike a held-out view's rendering and photograph are.
+pub(in crate::cli) struct ViewScore {
+    pub name: String,
+    /// In dB.
+    pub psnr: f64,
+    /// `None` for pictures that are too small for it.
+    pub ssim: Option<f64>,
+}
+
+impl PictureScores {
+    /// Mean over the views, in dB.
+    pub fn psnr(&self) -> Option<f64> {
+        mean(self.views.iter().map(|view| view.psnr).collect())
+    }
+
+    /// Mean over the views that are large enough.
+    pub fn ssim(&self) -> Option<f64> {
+        mean(self.views.iter().filter_map(|view| view.ssim).collect())
+    }
+
+    pub fn to_json(&self) -> Value {
+        json!({
+            "run": self.run,
+            "step": self.step,
+            "appearance": self.appearance,
+            "psnr": self.psnr(),
+            "ssim": self.ssim(),
+            "views": self
+                .views
+                .iter()
+                .map(|view| json!({ "name": view.name, "psnr": view.psnr, "ssim": view.ssim }))
+                .collect::<Vec<_>>(),
+        })
+    }
+
+    pub fn text(&self) -> String {
+        let in_words = |ssim: Option<f64>| {
+            ssim.map_or("too small for SSIM".into(), |ssim| format!("{ssim:.4}"))
+        };
+        let widths = self.views.iter().map(|view| view.name.len());
+        let width = widths.max().unwrap_or(0);
+        let mut text = String::new();
+        for ViewScore { name, psnr, ssim } in &self.views {
+            let _ = writeln!(text, "{name:<width$}  {psnr:6.2} dB  {}", in_words(*ssim));
+        }
+        let _ = write!(
+            text,
+            "{:<width$}  {:6.2} dB  {}",
+            "mean",
+            self.psnr().unwrap_or(f64::NAN),
+            in_words(self.ssim())
+        );
+        text
+    }
+}
+
+fn mean(present: Vec<f64>) -> Option<f64> {
+    (!present.is_empty()).then(|| present.iter().sum::<f64>() / present.len() as f64)
+}
+
+/// Renders the held-out views of a run with the appearance code that `at_eval` or else its settings say, and compares them with their
+/// photographs. `show` gets every pair; all of them at once might not fit into memory.
 ///
 /// # Errors
 /// Those of reading run and dataset; `Config` if no view was held out; whatever the device fails with.
-pub(super) fn score(
+pub(in crate::cli) fn score(
     run: &Path,
-    args: &EvalArgs,
+    dataset: Option<&Path>,
+    at_eval: Option<AppearanceAtEval>,
     context: &Context,
-) -> anyhow::Result<(Value, String)> {
+    show: &mut dyn FnMut(Rendered, Picture),
+) -> anyhow::Result<PictureScores> {
     let run = RunDirectory::open(run)?;
     let gpu = context.gpu()?;
-    let mut trained = Trained::open(&gpu, &run)?;
-    if let Some(appearance) = args.appearance {
-        trained.config.appearance.at_eval = appearance.into();
-    }
+    let trained = Trained::open(&gpu, &run)?;
+    let appearance = at_eval.unwrap_or(trained.config().appearance.at_eval);
     for refused in &trained.refused {
         context.warn(&refused.to_string());
     }
-    let scene = trained
-        .record
-        .open(args.dataset.as_deref(), &trained.config)?;
+    let scene = trained.record.open(dataset, trained.config())?;
     let held_out: Vec<usize> = scene.split(Split::Test).collect();
     if held_out.is_empty() {
         return Err(Error::Config {
@@ -45,11 +112,11 @@ pub(super) fn score(
         }
         .into());
     }
-    let viewer = trained.viewer(&scene)?;
+    let viewer = trained.viewer(&scene, appearance)?;
     let interrupted = interrupt::flag("stopping")?;
-    let masked = trained.config.scene.masks.reads();
+    let masked = trained.config().scene.masks.reads();
     let mut progress = Progress::new(context, "eval", 100 * held_out.len() as u64);
-    let mut scores = Vec::new();
+    let mut views = Vec::new();
     for (nth, &view) in held_out.iter().enumerate() {
         let name = &scene.views[view].name;
         let rendered = viewer.render(&scene, view, &mut |share| {
@@ -58,54 +125,25 @@ pub(super) fn score(
         })?;
         let picture = scene.load_picture(view)?;
         let (psnr, ssim) = compare(&rendered, &picture, masked);
-        scores.push((name, psnr, ssim));
+        views.push(ViewScore {
+            name: name.clone(),
+            psnr,
+            ssim,
+        });
+        show(rendered, picture);
     }
-    drop(progress);
-    let mean = |present: Vec<f64>| {
-        (!present.is_empty()).then(|| present.iter().sum::<f64>() / present.len() as f64)
-    };
-    let mean_psnr = mean(scores.iter().map(|(_, psnr, _)| *psnr).collect());
-    let mean_ssim = mean(scores.iter().filter_map(|(.., ssim)| *ssim).collect());
-    let in_words =
-        |ssim: Option<f64>| ssim.map_or("too small for SSIM".into(), |ssim| format!("{ssim:.4}"));
-    let mut text = String::new();
-    let width = scores
-        .iter()
-        .map(|(name, ..)| name.len())
-        .max()
-        .unwrap_or(0);
-    for (name, psnr, ssim) in &scores {
-        let _ = writeln!(text, "{name:<width$}  {psnr:6.2} dB  {}", in_words(*ssim));
-    }
-    let _ = write!(
-        text,
-        "{:<width$}  {:6.2} dB  {}",
-        "mean",
-        mean_psnr.unwrap_or(f64::NAN),
-        in_words(mean_ssim)
-    );
-    let report = json!({
-        "run": run.root(),
-        "step": trained.step,
-        "appearance": trained.config.appearance.at_eval,
-        "psnr": mean_psnr,
-        "ssim": mean_ssim,
-        "views": scores
-            .iter()
-            .map(|(name, psnr, ssim)| json!({ "name": name, "psnr": psnr, "ssim": ssim }))
-            .collect::<Vec<_>>(),
-    });
-    Ok((report, text))
+    Ok(PictureScores {
+        run: run.root().into(),
+        step: trained.step,
+        appearance,
+        views,
+    })
 }
 
 /// PSNR and SSIM of a rendering; with `masked`, of what its mask keeps.
 fn compare(rendered: &Rendered, picture: &Picture, masked: bool) -> (f64, Option<f64>) {
     let counts = |pixel: &[u8]| !masked || pixel[3] >= 128;
-    let photo: Vec<f32> = picture
-        .rgba
-        .chunks_exact(4)
-        .flat_map(|pixel| [0, 1, 2].map(|c| f32::from(pixel[c]) / 255.0))
-        .collect();
+    let photo = picture.rgb();
     // What does not count is made equal, and left out of the mean.
     let ours: Vec<f32> = rendered
         .rgb

@@ -14,7 +14,7 @@ use crate::mesh::Mesh;
 use crate::{Error, Result, scene};
 
 /// How a mesh is scored, and what the protocols take beside it.
-#[derive(Args, Clone, Debug)]
+#[derive(Args, Clone, Debug, Default)]
 #[command(next_help_heading = "Protocols")]
 pub struct ProtocolArgs {
     /// How a mesh is scored

@@ -9,8 +9,8 @@ use super::shapes::{PARTS, Part};
 
 /// Linear colour of the sky, in every direction.
 pub const SKY: DVec3 = dvec3(0.60, 0.70, 0.82);
-/// Towards the sun.
-const SUN: DVec3 = dvec3(0.48, -0.36, 0.80);
+/// Towards the sun: unit.
+pub const SUN: DVec3 = dvec3(0.48, -0.36, 0.80);
 const SUN_COLOR: DVec3 = dvec3(1.02, 0.95, 0.83);
 /// Light that comes back from below.
 const BOUNCE: DVec3 = dvec3(0.20, 0.17, 0.14);

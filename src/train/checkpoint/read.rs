@@ -274,9 +274,17 @@ fn inspect(path: &Path) -> Result<Checkpoint, Refusal> {
             "holds tensors that are not float32".into(),
         ));
     }
+    let state = read_state(&metadata)?;
+    tracing::info!(
+        file = %path.display(),
+        step = state.step,
+        tensors = tensors.len(),
+        bytes = size,
+        "checkpoint read"
+    );
     Ok(Checkpoint {
         path: path.to_path_buf(),
-        state: read_state(&metadata)?,
+        state,
         tensors,
         firsts,
     })

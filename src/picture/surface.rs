@@ -8,8 +8,9 @@
 use glam::{DMat4, DVec2, DVec3, Vec3, dvec2, dvec3, vec3};
 use rayon::prelude::*;
 
+use super::Rgb;
 use crate::mesh::Mesh;
-use crate::scene::synthetic;
+use crate::scene::synthetic::{self, SUN};
 
 /// Samples per pixel and axis.
 pub const OVERSAMPLING: usize = 2;
@@ -17,15 +18,6 @@ const PAPER: Vec3 = Vec3::new(0.90, 0.905, 0.91);
 const CLAY: Vec3 = Vec3::new(0.54, 0.505, 0.46);
 /// The inner side of the surface, where a mesh is open.
 const INNER_SIDE: Vec3 = Vec3::new(0.45, 0.16, 0.11);
-const SUN: DVec3 = dvec3(0.48, -0.36, 0.80);
-
-/// A finished picture: row-major sRGB, three bytes a pixel.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Rgb {
-    pub width: usize,
-    pub height: usize,
-    pub bytes: Vec<u8>,
-}
 
 /// From where, and onto how many pixels.
 #[derive(Clone, Copy, Debug)]
