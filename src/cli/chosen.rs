@@ -16,7 +16,7 @@ pub(super) struct Chosen {
     pub region: Region,
     /// Why the preset was chosen, if it was not named.
     pub why: String,
-    /// What speaks against it, if it was.
+    /// What speaks against them, and what about the dataset should be seen to.
     pub doubts: Vec<String>,
 }
 
@@ -30,8 +30,9 @@ impl Chosen {
         if settings.names_preset()? {
             let config = described(settings, flags)?;
             let region = Region::estimate(scene, &flags.region(&config))?;
+            let suggestion = Suggestion::of(scene, &region)?;
             return Ok(Chosen {
-                doubts: Suggestion::of(scene, &region)?.doubts(&config, scene, &region),
+                doubts: doubts(&suggestion, &config, scene, &region),
                 why: String::new(),
                 config,
                 region,
@@ -42,11 +43,17 @@ impl Chosen {
         let region = Region::estimate(scene, &flags.region(&config))?;
         Ok(Chosen {
             why: suggestion.in_words(),
-            doubts: suggestion.doubts(&config, scene, &region),
+            doubts: doubts(&suggestion, &config, scene, &region),
             config,
             region,
         })
     }
+}
+
+fn doubts(suggestion: &Suggestion, config: &Config, scene: &Scene, region: &Region) -> Vec<String> {
+    let mut doubts = suggestion.warnings(scene, region);
+    doubts.extend(suggestion.doubts(config, scene, region));
+    doubts
 }
 
 /// The settings for a new run, as far as they are known without looking at its dataset.

@@ -8,12 +8,12 @@ use clap::Args;
 use serde_json::{Value, json};
 
 use super::Context;
+use super::chosen::Chosen;
 use super::scene_args::SceneArgs;
+use super::settings::SettingsArgs;
 use super::suggestion::Suggestion;
 use crate::Error;
-use crate::scene::{
-    Facing, Region, RegionOverrides, RegionShape, Scene, SceneOptions, Split, write_preview,
-};
+use crate::scene::{Facing, Region, RegionShape, Scene, SceneOptions, Split, write_preview};
 
 /// Say what a dataset holds, what was skipped, and which region would be reconstructed
 #[derive(Args, Clone, Debug)]
@@ -49,8 +49,9 @@ pub(super) fn run(args: &InspectArgs, context: &Context) -> anyhow::Result<()> {
         .into());
     }
     let scene = Scene::open(&args.dataset, &args.scene.options(&SceneOptions::default()))?;
-    let region = Region::estimate(&scene, &args.scene.overrides(&RegionOverrides::default()))?;
     let suggestion = Suggestion::for_scene(&scene, &args.scene)?;
+    // The one that `train` would take.
+    let Chosen { region, .. } = Chosen::of(&SettingsArgs::default(), &args.scene, &scene)?;
     if let Some(preview) = &args.preview {
         write_preview(&scene, &region, preview)?;
     }
@@ -70,44 +71,6 @@ fn cameras(scene: &Scene) -> BTreeMap<(&'static str, u32, u32), usize> {
             .or_default() += 1;
     }
     counts
-}
-
-/// What a reader of the report should do something about.
-fn warnings(scene: &Scene, facing: Facing, region: &Region) -> Vec<String> {
-    let mut warnings = Vec::new();
-    let train = scene.split(Split::Train).count();
-    if train < 20 {
-        warnings.push(format!(
-            "only {train} training views: surfaces that few of them see will be guesses"
-        ));
-    }
-    let inside = region.cameras_inside(scene);
-    if facing == Facing::Outward && inside < scene.views.len() {
-        let outside = scene.views.len() - inside;
-        warnings.push(format!(
-            "the cameras look outwards, but {outside} of {} stand outside the region: enlarge it (--region-scale, --radius)",
-            scene.views.len()
-        ));
-    }
-    let points = region.points_inside(scene);
-    if !scene.points.is_empty() && points * 5 < scene.points.len() {
-        warnings.push(format!(
-            "only {points} of {} points lie inside the region: look at the preview (--preview FILE)",
-            scene.points.len()
-        ));
-    }
-    let seeing = scene
-        .views
-        .iter()
-        .filter(|view| view.sees(region.center).is_some())
-        .count();
-    if facing == Facing::Inward && seeing * 2 < scene.views.len() {
-        warnings.push(format!(
-            "the region's centre is in {seeing} of {} pictures only",
-            scene.views.len()
-        ));
-    }
-    warnings
 }
 
 fn report(
@@ -141,7 +104,7 @@ fn report(
         },
         "skipped": scene.skipped,
         "notes": scene.notes,
-        "warnings": warnings(scene, suggestion.looks.facing, region),
+        "warnings": suggestion.warnings(scene, region),
         "preview": preview,
     })
 }
@@ -237,7 +200,7 @@ fn as_text(
     for note in &scene.notes {
         row("note", note.clone());
     }
-    for warning in warnings(scene, suggestion.looks.facing, region) {
+    for warning in suggestion.warnings(scene, region) {
         row("warning", warning);
     }
     if let Some(preview) = preview {

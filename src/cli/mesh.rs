@@ -69,8 +69,7 @@ pub(super) fn run(args: &MeshArgs, context: &Context) -> anyhow::Result<()> {
 }
 
 /// Said of a run that has learned no surface.
-pub(super) const NO_SURFACE: &str =
-    "the signed distance has no zero surface in the region (or the crop box)";
+pub(super) const NO_SURFACE: &str = "the signed distance has no zero surface in the region";
 
 /// The error of a run that has learned no surface, for those who cannot do without.
 pub(super) fn no_surface(run: &Path) -> Error {
@@ -146,6 +145,15 @@ pub(super) fn take(args: &MeshArgs, context: &Context) -> anyhow::Result<Option<
         ..ExtractOptions::of(&trained.region)
     };
     let (mut mesh, stats) = surface(&gpu, &trained, &options, context)?;
+    if let (true, Some([x0, y0, z0, x1, y1, z1])) = (mesh.faces.is_empty(), args.crop) {
+        return Err(Error::Config {
+            what: format!(
+                "--crop {x0},{y0},{z0},{x1},{y1},{z1}: no surface crosses that box\n  next: look at the mesh without --crop for where it is, \
+                 in the coordinates of the cameras"
+            ),
+        }
+        .into());
+    }
     if stats.steepest > STEEPEST {
         context.warn(&format!(
             "the signed distance has slopes up to {:.1}, above the {STEEPEST} that was supposed: --exhaustive makes sure that nothing is missing",
@@ -160,7 +168,17 @@ pub(super) fn take(args: &MeshArgs, context: &Context) -> anyhow::Result<Option<
     if args.keep_largest {
         clean::keep_largest(&mut mesh);
     } else if args.min_faces > 0 {
+        let faces = mesh.faces.len();
         clean::drop_small(&mut mesh, args.min_faces);
+        if mesh.faces.is_empty() && faces > 0 {
+            return Err(Error::Config {
+                what: format!(
+                    "--min-faces {}: none of the {faces} faces is part of so large a piece\n  next: a smaller number, or --keep-largest",
+                    args.min_faces
+                ),
+            }
+            .into());
+        }
     }
     if mesh.faces.is_empty() {
         return Ok(None);

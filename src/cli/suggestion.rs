@@ -89,6 +89,45 @@ impl Suggestion {
         )
     }
 
+    /// What its owner should do something about, whatever the settings.
+    pub fn warnings(&self, scene: &Scene, region: &Region) -> Vec<String> {
+        let facing = self.looks.facing;
+        let mut warnings = Vec::new();
+        let train = scene.split(Split::Train).count();
+        if train < 20 {
+            warnings.push(format!(
+                "only {train} training views: surfaces that few of them see will be guesses"
+            ));
+        }
+        let inside = region.cameras_inside(scene);
+        if facing == Facing::Outward && inside < scene.views.len() {
+            let outside = scene.views.len() - inside;
+            warnings.push(format!(
+                "the cameras look outwards, but {outside} of {} stand outside the region: enlarge it (--region-scale, --radius)",
+                scene.views.len()
+            ));
+        }
+        let points = region.points_inside(scene);
+        if !scene.points.is_empty() && points * 5 < scene.points.len() {
+            warnings.push(format!(
+                "only {points} of {} points lie inside the region: look at the preview (--preview FILE)",
+                scene.points.len()
+            ));
+        }
+        let seeing = scene
+            .views
+            .iter()
+            .filter(|view| view.sees(region.center).is_some())
+            .count();
+        if facing == Facing::Inward && seeing * 2 < scene.views.len() {
+            warnings.push(format!(
+                "the region's centre is in {seeing} of {} pictures only",
+                scene.views.len()
+            ));
+        }
+        warnings
+    }
+
     /// What speaks against a configuration that was asked for. It is used all the same.
     pub fn doubts(&self, config: &Config, scene: &Scene, region: &Region) -> Vec<String> {
         let mut doubts: Vec<String> = cameras_in_matter(config, scene, region)

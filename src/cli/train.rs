@@ -13,7 +13,6 @@ use crate::train::checkpoint::{self, Latest};
 use crate::train::report::{Control, Event, Log};
 use crate::train::run_directory::{RunDirectory, SceneRecord};
 use crate::{Error, Result};
-use anyhow::Context as _;
 use clap::Args;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
@@ -85,9 +84,11 @@ pub(super) fn train_or_resume(
     scene: SceneArgs,
     context: &Context,
 ) -> anyhow::Result<Done> {
-    let has_checkpoint = RunDirectory::open(out)
-        .and_then(|run| checkpoint::latest(&run.checkpoints()))
-        .is_ok();
+    // A checkpoint that cannot be read is no reason to begin anew: what is wrong with it is said by going on.
+    let has_checkpoint = match RunDirectory::open(out) {
+        Ok(run) => !checkpoint::files(&run.checkpoints())?.is_empty(),
+        Err(_) => false,
+    };
     let args = TrainArgs {
         dataset: Some(dataset.into()),
         out: Some(out.into()),
@@ -257,10 +258,20 @@ fn resumed(args: &TrainArgs, out: &Path) -> Result<Resumed> {
     let state = latest.checkpoint.state();
     let mut was = state.config.clone();
     let second_asked = args.settings.stage == Some(2);
-    if state.step == was.steps && (was.stage2.steps > 0 || second_asked) {
-        // The first stage is done and keeps its length; one that was begun without a second now gets its preset's.
+    let first_is_done = was.first_step == 0 && state.step == was.steps;
+    if first_is_done && (was.stage2.steps > 0 || second_asked) {
+        // The first stage keeps its length; one that was begun without a second now gets its preset's.
         was.stage2.steps = match args.settings.steps {
-            Some(total) => total.saturating_sub(was.steps),
+            Some(total) if total <= was.steps => {
+                return Err(Error::Config {
+                    what: format!(
+                        "--steps {total}: the first stage is done with its {} steps, which leaves none for the second\n  next: more --steps, or none \
+                         to keep what the run had",
+                        was.steps
+                    ),
+                });
+            }
+            Some(total) => total - was.steps,
             None if second_asked && was.stage2.steps == 0 => {
                 Config::preset(&was.preset)?.stage2.steps
             }
@@ -373,13 +384,14 @@ impl Task {
     /// # Errors
     /// [`Error::Interrupted`] after Ctrl-C, with a checkpoint saved; those of writing the run directory and of [`Trainer::run`].
     pub fn run(mut self, force: bool, context: &Context) -> anyhow::Result<Done> {
+        // From here on an interruption is an orderly one.
+        let interrupted = interrupt::flag("saving a checkpoint")?;
         let run = match &self.resumed {
             Some(_) => RunDirectory::resume(&self.out)?,
             None => RunDirectory::create(&self.out, force)?,
         };
         run.write(&run.scene(), &self.record.to_json())?;
         run.write(&run.config(), &self.config.to_toml())?;
-        let interrupted = interrupt::flag("saving a checkpoint")?;
         let mut teller = Teller {
             context,
             log: Log::append(&run.log())?,
@@ -421,10 +433,13 @@ impl Task {
         if let Some(error) = failed {
             return Err(error.into());
         }
-        outcome.with_context(|| match &checkpoint {
-            Some(path) => format!("the last checkpoint is {}", path.display()),
-            None => "there is no checkpoint of this run yet".into(),
-        })?;
+        if outcome.is_err() {
+            context.say(&match &checkpoint {
+                Some(path) => format!("kept     {} is the last checkpoint", path.display()),
+                None => "kept     nothing: there was no checkpoint of this run yet".into(),
+            });
+        }
+        outcome?;
         Ok(Done {
             run: run.root().into(),
             steps: steps_done,

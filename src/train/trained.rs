@@ -51,6 +51,8 @@ impl Trained {
                 gpu.upload(values, span.first + first, numbers)
             })?;
         }
+        let mean = state.config.appearance.at_eval == AppearanceAtEval::Mean;
+        model.set_evaluation_code(gpu, mean)?;
         gpu.finish()?;
         Ok(Trained {
             gpu: gpu.clone(),
