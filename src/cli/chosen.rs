@@ -27,23 +27,31 @@ impl Chosen {
     /// [`crate::Error::Config`] for settings or a region that make no sense; [`crate::Error::Input`] for a file or picture that cannot be
     /// read.
     pub fn of(settings: &SettingsArgs, flags: &SceneArgs, scene: &Scene) -> Result<Chosen> {
-        if settings.names_preset()? {
-            let config = described(settings, flags)?;
-            let region = Region::estimate(scene, &flags.region(&config))?;
-            let suggestion = Suggestion::of(scene, &region)?;
-            return Ok(Chosen {
-                doubts: doubts(&suggestion, &config, scene, &region),
-                why: String::new(),
-                config,
-                region,
-            });
-        }
-        let suggestion = Suggestion::for_scene(scene, flags)?;
-        let config = flags.put_into(settings.resolve(suggestion.config()?)?)?;
+        let (config, why, suggestion) = match settings.names_preset()? {
+            true => (described(settings, flags)?, String::new(), None),
+            false => {
+                let suggestion = Suggestion::for_scene(scene, flags)?;
+                let config = flags.put_into(settings.resolve(suggestion.config()?)?)?;
+                (config, suggestion.in_words(), Some(suggestion))
+            }
+        };
         let region = Region::estimate(scene, &flags.region(&config))?;
+        tracing::info!(
+            center = ?region.center.to_array(),
+            radius = region.radius,
+            shape = ?region.shape,
+            how = region.how,
+            preset = config.preset,
+            suggested = suggestion.is_some(),
+            "region and preset chosen"
+        );
+        let suggestion = match suggestion {
+            Some(suggestion) => suggestion,
+            None => Suggestion::of(scene, &region)?,
+        };
         Ok(Chosen {
-            why: suggestion.in_words(),
             doubts: doubts(&suggestion, &config, scene, &region),
+            why,
             config,
             region,
         })

@@ -162,12 +162,12 @@ impl Region {
                 "give one with --center x,y,z --radius r",
             ));
         }
-        tracing::info!(
+        tracing::debug!(
             center = ?region.center.to_array(),
             radius = region.radius,
             shape = ?region.shape,
             how = region.how,
-            "region chosen"
+            "region estimated"
         );
         Ok(region)
     }

@@ -41,7 +41,7 @@ fn insides_are_told_as_far_as_asked() {
     let told = train(None, &["--steps", "4", "-v"]);
     for what in [
         "info: dataset opened format=\"Neuralangelo",
-        "info: region chosen center=",
+        "info: region and preset chosen center=",
         "info: device chosen device=",
         "info: pipeline cache opened file=",
         "info: tuning answers taken file=",
