@@ -14,8 +14,8 @@ use rayon::prelude::*;
 use serde::Serialize;
 
 use crate::mesh::bvh::{Bvh, Triangle};
-use crate::mesh::visibility::Viewpoint;
 use crate::mesh::{Mesh, bounds};
+use crate::scene::View;
 use crate::{Error, Result};
 
 /// How to score.
@@ -333,6 +333,30 @@ fn surface_samples<V: Viewpoint>(
     });
     let scored = scored.collect();
     (kept.into_iter().map(|(p, _)| p).collect(), scored)
+}
+
+/// A camera as far as seeing is concerned.
+pub trait Viewpoint: Sync {
+    /// Rigid; the camera looks along its −z.
+    fn world_from_camera(&self) -> DMat4;
+    /// Width and height in pixels.
+    fn size(&self) -> [u32; 2];
+    /// Pixel (centres at +0.5) of a point in the camera's frame; `None` if no pixel can show it. May lie outside the image.
+    fn project(&self, p_camera: DVec3) -> Option<DVec2>;
+}
+
+impl Viewpoint for View {
+    fn world_from_camera(&self) -> DMat4 {
+        self.world_from_camera
+    }
+
+    fn size(&self) -> [u32; 2] {
+        [self.camera.width, self.camera.height]
+    }
+
+    fn project(&self, p_camera: DVec3) -> Option<DVec2> {
+        self.camera.project(p_camera)
+    }
 }
 
 /// A view with what is asked of it most.
