@@ -15,6 +15,7 @@ pub mod mesh;
 pub mod model;
 pub mod render;
 pub mod scene;
+mod srgb;
 pub mod train;
 
 pub use error::{Error, Result};

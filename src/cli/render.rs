@@ -5,6 +5,7 @@ use super::{Context, interrupt};
 use crate::config::AppearanceAtEval;
 use crate::render::Rendered;
 use crate::scene::{Camera, Scene, Split};
+use crate::srgb::byte;
 use crate::train::run_directory::RunDirectory;
 use crate::train::trained::Trained;
 use crate::{Error, Result};
@@ -249,7 +250,6 @@ fn write(
             "make room or mend the permissions there",
         )
     };
-    let byte = |value: f32| (value.clamp(0.0, 1.0) * 255.0).round() as u8;
     let at = |x: u32, y: u32| (y * width + x) as usize;
     match what {
         What::Rgb => {

@@ -13,7 +13,7 @@ use glam::{DMat3, DMat4, DVec3, Vec3};
 use super::Mesh;
 use super::marching_cubes::{MAX_VERTICES, Marcher, OUTSIDE, Sink};
 use crate::scene::{Region, RegionShape};
-use crate::{Error, Result};
+use crate::{Error, Result, srgb};
 
 /// Signed distances on a regular lattice, in the region frame; positive in free space.
 pub trait Lattice {
@@ -230,10 +230,7 @@ pub fn add_attributes(
             (points.len(), points.len()),
             "attributes per point"
         );
-        colors.extend(
-            rgb.iter()
-                .map(|rgb| rgb.map(|channel| (channel.clamp(0.0, 1.0) * 255.0).round() as u8)),
-        );
+        colors.extend(rgb.iter().map(|rgb| rgb.map(srgb::byte)));
         normals.extend(
             gradients
                 .iter()

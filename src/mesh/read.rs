@@ -6,7 +6,7 @@ use std::path::Path;
 use glam::DVec3;
 
 use super::Mesh;
-use crate::{Error, Result};
+use crate::{Error, Result, srgb};
 
 /// Reads a mesh, or a point cloud where there are no faces. Polygons are cut into fans. Normals and colours are kept if every vertex has
 /// them.
@@ -311,7 +311,7 @@ fn ply_vertices(element: &Element, values: &mut Values, mesh: &mut Mesh) -> Pars
         mesh.normals
             .extend(normal.map(|at| at.map(|i| row[i] as f32)));
         mesh.colors.extend(
-            color.map(|at| at.map(|i| to_byte(row[i] / element.properties[i].scalar.full()))),
+            color.map(|at| at.map(|i| srgb::byte(row[i] / element.properties[i].scalar.full()))),
         );
     }
     Ok(())
@@ -374,7 +374,7 @@ fn parse_obj(bytes: &[u8]) -> Parsed<Mesh> {
                 }
                 mesh.positions.push(DVec3::new(x, y, z));
                 if count == 6 {
-                    mesh.colors.push([r, g, b].map(to_byte));
+                    mesh.colors.push([r, g, b].map(srgb::byte));
                 }
             }
             Some("vn") => {
@@ -437,10 +437,6 @@ fn parse_obj(bytes: &[u8]) -> Parsed<Mesh> {
             .unwrap_or_default();
     }
     Ok(mesh)
-}
-
-fn to_byte(fraction: f64) -> u8 {
-    (fraction.clamp(0.0, 1.0) * 255.0).round() as u8
 }
 
 fn add_fan(polygon: &[u32], faces: &mut Vec<[u32; 3]>) {

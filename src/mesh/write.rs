@@ -11,7 +11,7 @@ use glam::DVec3;
 use serde_json::json;
 
 use super::{Mesh, bounds};
-use crate::{Error, Result};
+use crate::{Error, Result, srgb};
 
 /// File formats that meshes are written in.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -360,21 +360,11 @@ fn glb(out: &mut impl Write, mesh: &Mesh) -> std::io::Result<()> {
     for normal in &mesh.normals {
         out.write_all(bytemuck::bytes_of(&normal.map(f32::to_le_bytes)))?;
     }
-    let linear: [u16; 256] = std::array::from_fn(|srgb| linear_from_srgb(srgb as u8));
+    let linear: [u16; 256] =
+        std::array::from_fn(|byte| (65535.0 * srgb::decode(byte as u8)).round() as u16);
     for color in &mesh.colors {
         let [r, g, b] = color.map(|channel| linear[channel as usize].to_le_bytes());
         out.write_all(bytemuck::bytes_of(&[r, g, b, [0xff, 0xff]]))?;
     }
     Ok(())
-}
-
-/// IEC 61966-2-1, as a 16-bit fraction.
-fn linear_from_srgb(srgb: u8) -> u16 {
-    let s = f64::from(srgb) / 255.0;
-    let linear = if s <= 0.04045 {
-        s / 12.92
-    } else {
-        ((s + 0.055) / 1.055).powf(2.4)
-    };
-    (linear * 65535.0).round() as u16
 }

@@ -14,13 +14,13 @@ use glam::{DMat4, DVec2, DVec3, dvec2, dvec3};
 use rayon::prelude::*;
 use serde_json::json;
 
-use crate::{Error, Result};
+use crate::{Error, Result, srgb};
 
 mod paint;
 mod shapes;
 mod tracing;
 
-pub use tracing::{Hit, SKY, encode_srgb, normal, radiance, sdf, trace};
+pub use tracing::{Hit, SKY, normal, radiance, sdf, trace};
 
 /// Centre of the sphere that holds the scene, and its radius: what `sphere_center` and `sphere_radius` say in the dataset.
 pub const CENTER: DVec3 = dvec3(0.0, 0.0, 0.40);
@@ -150,7 +150,7 @@ impl SyntheticOptions {
                                 .map_or(SKY, |hit| tracing::radiance(&hit));
                     }
                     for (byte, value) in pixel.iter_mut().zip(linear.to_array()) {
-                        *byte = tracing::encode_srgb(value);
+                        *byte = srgb::encode(value);
                     }
                 }
             });
@@ -414,7 +414,7 @@ fn write_points(path: &Path, points: &[ReferencePoint]) -> std::io::Result<()> {
         {
             file.write_all(&(value as f32).to_le_bytes())?;
         }
-        file.write_all(&point.color.to_array().map(tracing::encode_srgb))?;
+        file.write_all(&point.color.to_array().map(srgb::encode))?;
     }
     file.into_inner().map_err(|e| e.into_error())?.sync_all()
 }

@@ -8,6 +8,7 @@ use crate::config::Config;
 use crate::gpu::Buffer;
 use crate::render::{Rendered, TERMS};
 use crate::scene::{Camera, Scene, Split};
+use crate::srgb::byte;
 use crate::{Error, Result};
 use glam::DMat4;
 use image::imageops::{self, FilterType};
@@ -392,11 +393,6 @@ impl PreviewView {
             world_from_camera: from.world_from_camera,
         })
     }
-}
-
-/// 8-bit value of a number in [0, 1].
-fn byte(value: f32) -> u8 {
-    (value.clamp(0.0, 1.0) * 255.0).round() as u8
 }
 
 fn psnr(rendered: &Rendered, photo: &RgbaImage) -> f64 {
