@@ -13,6 +13,7 @@ pub mod gpu;
 pub mod kernels;
 pub mod mesh;
 pub mod model;
+mod ply;
 pub mod render;
 pub mod scene;
 mod srgb;

@@ -327,6 +327,13 @@ fn ply_of_other_programs() {
         mesh
     );
 
+    // Lines that say nothing of the values, and lists among a vertex's numbers.
+    let odd = ASCII
+        .replace("comment", "made by some program\nobj_info none\n\ncomment")
+        .replace("float quality", "list uchar int seen_by")
+        .replace(" 0.5 ", " 2 7 8 ");
+    assert_eq!(parse("d.ply", odd.as_bytes()).unwrap(), mesh);
+
     let mut big = b"ply\nformat binary_big_endian 1.0\nelement vertex 3\nproperty short x\nproperty double y\nproperty float z\n\
         property float red\nproperty float green\nproperty float blue\nelement face 1\nproperty list uint ushort vertex_index\nend_header\n"
         .to_vec();
@@ -392,6 +399,25 @@ fn damaged_files_are_refused() {
         assert!(
             matches!(parse("a.obj", text.as_bytes()), Err(Error::Input { .. })),
             "{text:?}"
+        );
+    }
+    // What is wrong is said with its place and numbers.
+    for (from, to, said) in [
+        (
+            "vertex 4",
+            "vertex 40",
+            "promises 40 of 'vertex' of at least 14 bytes each",
+        ),
+        ("0 1\n", "0\n \n", "ends within edge 0 of 1"),
+        ("4 5 6", "4 e 6", "'e' is not a number"),
+        ("float quality", "quaternion quality", "'quaternion'"),
+        ("face 2", "face two", "'element face two' has no count"),
+    ] {
+        assert!(ASCII.contains(from));
+        let error = parse("a.ply", ASCII.replacen(from, to, 1).as_bytes()).unwrap_err();
+        assert!(
+            error.to_string().contains(said),
+            "{from:?} → {to:?}: {error}"
         );
     }
     assert!(matches!(parse("a.stl", b"solid"), Err(Error::Input { .. })));

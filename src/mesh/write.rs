@@ -11,6 +11,7 @@ use glam::DVec3;
 use serde_json::json;
 
 use super::{Mesh, bounds};
+use crate::ply::{self, Element, Scalar};
 use crate::{Error, Result, srgb};
 
 /// File formats that meshes are written in.
@@ -163,57 +164,36 @@ fn needs_f64(mesh: &Mesh) -> bool {
 }
 
 fn ply(out: &mut impl Write, mesh: &Mesh) -> std::io::Result<()> {
-    let wide = needs_f64(mesh);
-    let real = if wide { "double" } else { "float" };
-    write!(
-        out,
-        "ply\nformat binary_little_endian 1.0\ncomment neurodin\nelement vertex {}\n",
-        mesh.positions.len()
-    )?;
-    write!(
-        out,
-        "property {real} x\nproperty {real} y\nproperty {real} z\n"
-    )?;
+    let real = match needs_f64(mesh) {
+        true => Scalar::F64,
+        false => Scalar::F32,
+    };
+    let mut vertex = Element::new("vertex", mesh.positions.len()).with(real, &["x", "y", "z"]);
     if !mesh.normals.is_empty() {
-        write!(
-            out,
-            "property float nx\nproperty float ny\nproperty float nz\n"
-        )?;
+        vertex = vertex.with(Scalar::F32, &["nx", "ny", "nz"]);
     }
     if !mesh.colors.is_empty() {
-        write!(
-            out,
-            "property uchar red\nproperty uchar green\nproperty uchar blue\n"
-        )?;
+        vertex = vertex.with(Scalar::U8, &["red", "green", "blue"]);
     }
+    let mut elements = vec![vertex];
     if !mesh.faces.is_empty() {
-        write!(
-            out,
-            "element face {}\nproperty list uchar int vertex_indices\n",
-            mesh.faces.len()
-        )?;
+        let face = Element::new("face", mesh.faces.len());
+        elements.push(face.with_list(Scalar::U8, Scalar::I32, "vertex_indices"));
     }
-    writeln!(out, "end_header")?;
-    for (vertex, p) in mesh.positions.iter().enumerate() {
-        if wide {
-            out.write_all(bytemuck::bytes_of(&p.to_array().map(f64::to_le_bytes)))?;
-        } else {
-            out.write_all(bytemuck::bytes_of(
-                &p.as_vec3().to_array().map(f32::to_le_bytes),
-            ))?;
+    ply::write(out, "neurodin", &elements, |element, index, values| {
+        if element == "face" {
+            values.push(3.0);
+            values.extend(mesh.faces[index].map(f64::from));
+            return;
         }
-        if let Some(normal) = mesh.normals.get(vertex) {
-            out.write_all(bytemuck::bytes_of(&normal.map(f32::to_le_bytes)))?;
+        values.extend(mesh.positions[index].to_array());
+        if let Some(normal) = mesh.normals.get(index) {
+            values.extend(normal.map(f64::from));
         }
-        if let Some(color) = mesh.colors.get(vertex) {
-            out.write_all(color)?;
+        if let Some(color) = mesh.colors.get(index) {
+            values.extend(color.map(f64::from));
         }
-    }
-    for face in &mesh.faces {
-        out.write_all(&[3])?;
-        out.write_all(bytemuck::bytes_of(&face.map(u32::to_le_bytes)))?;
-    }
-    Ok(())
+    })
 }
 
 fn obj(out: &mut impl Write, mesh: &Mesh) -> std::io::Result<()> {

@@ -8,6 +8,7 @@ use std::path::Path;
 use glam::{DVec2, DVec3};
 
 use super::{Region, RegionShape, Scene, Split};
+use crate::ply::{self, Element, Scalar};
 use crate::{Error, Result};
 
 const TRAIN: [u8; 3] = [40, 110, 230];
@@ -135,25 +136,24 @@ fn outline(region: &Region, drawing: &mut Drawing) {
 }
 
 fn write_ply(drawing: &Drawing, path: &Path) -> Result<()> {
-    let mut data = format!(
-        "ply\nformat binary_little_endian 1.0\ncomment neurodin preview: cameras, points, region; world coordinates\n\
-         element vertex {}\nproperty double x\nproperty double y\nproperty double z\n\
-         property uchar red\nproperty uchar green\nproperty uchar blue\n\
-         element edge {}\nproperty int vertex1\nproperty int vertex2\nend_header\n",
-        drawing.vertices.len(),
-        drawing.edges.len()
-    )
-    .into_bytes();
-    for (position, color) in &drawing.vertices {
-        for coordinate in position.to_array() {
-            data.extend(coordinate.to_le_bytes());
+    let elements = [
+        Element::new("vertex", drawing.vertices.len())
+            .with(Scalar::F64, &["x", "y", "z"])
+            .with(Scalar::U8, &["red", "green", "blue"]),
+        Element::new("edge", drawing.edges.len()).with(Scalar::I32, &["vertex1", "vertex2"]),
+    ];
+    let comment = "neurodin preview: cameras, points, region; world coordinates";
+    let mut data = Vec::new();
+    ply::write(&mut data, comment, &elements, |element, index, values| {
+        if element == "edge" {
+            values.extend(drawing.edges[index].map(f64::from));
+            return;
         }
-        data.extend(color);
-    }
-    for [from, to] in &drawing.edges {
-        data.extend((*from as i32).to_le_bytes());
-        data.extend((*to as i32).to_le_bytes());
-    }
+        let (position, color) = drawing.vertices[index];
+        values.extend(position.to_array());
+        values.extend(color.map(f64::from));
+    })
+    .expect("memory takes everything");
     let cannot = |error: &dyn std::fmt::Display| Error::Output {
         path: path.to_path_buf(),
         what: format!(

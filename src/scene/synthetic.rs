@@ -7,13 +7,13 @@
 
 use std::f64::consts::PI;
 use std::fs;
-use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use glam::{DMat4, DVec2, DVec3, dvec2, dvec3};
 use rayon::prelude::*;
 use serde_json::json;
 
+use crate::ply::{self, Element, Scalar};
 use crate::{Error, Result, srgb};
 
 mod paint;
@@ -391,30 +391,18 @@ pub fn look(azimuth: f64, elevation: f64, distance: f64, target: DVec3) -> DMat4
 
 /// Binary PLY: position, normal, sRGB colour.
 fn write_points(path: &Path, points: &[ReferencePoint]) -> std::io::Result<()> {
+    let vertex = Element::new("vertex", points.len())
+        .with(Scalar::F32, &["x", "y", "z", "nx", "ny", "nz"])
+        .with(Scalar::U8, &["red", "green", "blue"]);
+    let comment =
+        "exact surface, seen by two or more training cameras; world frame of transforms.json";
     let mut file = std::io::BufWriter::new(fs::File::create(path)?);
-    writeln!(file, "ply\nformat binary_little_endian 1.0")?;
-    writeln!(
-        file,
-        "comment exact surface, seen by two or more training cameras; world frame of transforms.json"
-    )?;
-    writeln!(file, "element vertex {}", points.len())?;
-    for name in ["x", "y", "z", "nx", "ny", "nz"] {
-        writeln!(file, "property float {name}")?;
-    }
-    for name in ["red", "green", "blue"] {
-        writeln!(file, "property uchar {name}")?;
-    }
-    writeln!(file, "end_header")?;
-    for point in points {
-        for value in point
-            .position
-            .to_array()
-            .into_iter()
-            .chain(point.normal.to_array())
-        {
-            file.write_all(&(value as f32).to_le_bytes())?;
-        }
-        file.write_all(&point.color.to_array().map(srgb::encode))?;
-    }
+    ply::write(&mut file, comment, &[vertex], |_, index, values| {
+        let point = &points[index];
+        values.extend(point.position.to_array());
+        values.extend(point.normal.to_array());
+        let color = point.color.to_array().map(srgb::encode);
+        values.extend(color.map(f64::from));
+    })?;
     file.into_inner().map_err(|e| e.into_error())?.sync_all()
 }
