@@ -14,6 +14,7 @@ pub mod kernels;
 pub mod mesh;
 pub mod model;
 mod ply;
+mod random;
 pub mod render;
 pub mod scene;
 mod srgb;

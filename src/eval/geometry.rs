@@ -16,7 +16,7 @@ use serde::Serialize;
 use crate::mesh::bvh::{Bvh, Triangle};
 use crate::mesh::{Mesh, bounds};
 use crate::scene::View;
-use crate::{Error, Result};
+use crate::{Error, Result, random};
 
 /// How to score.
 #[derive(Clone, Debug)]
@@ -445,20 +445,13 @@ fn draw_uncropped(mesh: &Mesh, faces: &[usize], n: usize, seed: u64) -> Vec<(DVe
 /// Three numbers in [0, 1) that depend on nothing but (seed, index).
 fn uniforms(seed: u64, index: u64) -> [f64; 3] {
     std::array::from_fn(|i| {
-        let bits = mixed(seed, index.wrapping_mul(3).wrapping_add(i as u64));
-        (bits >> 11) as f64 / (1u64 << 53) as f64
+        let nth = index.wrapping_mul(3).wrapping_add(i as u64);
+        random::unit(mixed(seed, nth))
     })
 }
 
-/// Bits that depend on nothing but (seed, index): SplitMix64 (Steele, Lea & Flood 2014).
+/// Bits that depend on nothing but (seed, index).
 pub(super) fn mixed(seed: u64, index: u64) -> u64 {
-    let mix = |x: u64| {
-        let x = (x ^ (x >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        let x = (x ^ (x >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        x ^ (x >> 31)
-    };
-    let start = mix(seed.wrapping_mul(0x9e37_79b9_7f4a_7c15));
-    mix(start
-        .wrapping_add(index)
-        .wrapping_mul(0x9e37_79b9_7f4a_7c15))
+    let start = random::mix(seed.wrapping_mul(random::STEP));
+    random::mix(start.wrapping_add(index).wrapping_mul(random::STEP))
 }
