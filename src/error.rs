@@ -81,6 +81,12 @@ impl Error {
         }
     }
 
+    /// An output that cannot be written, made, or cleared away.
+    pub fn unwritable(path: impl AsRef<Path>, error: &dyn std::fmt::Display) -> Self {
+        let next = "make room or mend the permissions there, or name another place";
+        Error::output(path, format!("cannot be written: {error}"), next)
+    }
+
     /// A failed file operation on `path`.
     pub fn io(path: impl AsRef<Path>, source: std::io::Error) -> Self {
         Error::Io {

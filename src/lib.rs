@@ -19,5 +19,6 @@ pub mod render;
 pub mod scene;
 mod srgb;
 pub mod train;
+mod whole_file;
 
 pub use error::{Error, Result};

@@ -2,10 +2,11 @@
 
 use super::device::{Context, Gpu, GpuOptions, vulkan};
 use super::instance::DeviceInfo;
-use crate::{Error, Result};
+use crate::{Error, Result, whole_file};
 use ash::vk;
 use bytemuck::Pod;
 use std::collections::HashMap;
+use std::io::Write;
 use std::marker::PhantomData;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
@@ -170,7 +171,7 @@ impl Pipelines {
         })
     }
 
-    /// Writes the cache where it has grown: first beside its place, then into it, so that a reader never meets half a file.
+    /// Writes the cache where it has grown.
     fn save(&self) -> Result<()> {
         let Some((file, known)) = &self.cache_file else {
             return Ok(());
@@ -182,11 +183,9 @@ impl Pipelines {
             return Ok(());
         }
         let folder = file.parent().expect("the file lies in the cache's folder");
-        let failed = |error| Error::io(file, error);
-        std::fs::create_dir_all(folder).map_err(failed)?;
-        let beside = file.with_extension(format!("{}.part", std::process::id()));
-        std::fs::write(&beside, data).map_err(failed)?;
-        std::fs::rename(&beside, file).map_err(failed)
+        std::fs::create_dir_all(folder)
+            .and_then(|()| whole_file::replace(file, |out| out.write_all(&data)))
+            .map_err(|error| Error::unwritable(file, &error))
     }
 
     fn build(
@@ -254,7 +253,7 @@ impl Pipelines {
         let built = if invocations > info.max_workgroup {
             Err(Error::NoDevice {
                 what: format!(
-                    "kernel {} has workgroups of {invocations}, {} ends at {}",
+                    "kernel {} has workgroups of {invocations}, {} ends at {}\n  next: choose another device",
                     module.name, info.name, info.max_workgroup
                 ),
             })

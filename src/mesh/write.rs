@@ -1,10 +1,10 @@
 //! Writing meshes: binary PLY, OBJ, and GLB (glTF 2.0), chosen by the file's extension.
 //!
-//! A file appears whole or not at all: it is written beside its destination, synced and renamed. Colours are sRGB bytes in PLY
-//! (`red green blue`), sRGB fractions after the position in OBJ, and linear 16-bit `COLOR_0` in GLB, as its specification wants.
+//! A file appears whole or not at all. Colours are sRGB bytes in PLY (`red green blue`), sRGB fractions after the position in OBJ, and
+//! linear 16-bit `COLOR_0` in GLB, as its specification wants.
 
 use std::fs::File;
-use std::io::{BufWriter, Write};
+use std::io::{BufWriter, ErrorKind, Write};
 use std::path::Path;
 
 use glam::DVec3;
@@ -12,6 +12,7 @@ use serde_json::json;
 
 use super::{Mesh, bounds};
 use crate::ply::{self, Element, Scalar};
+use crate::whole_file::{self, folder_of};
 use crate::{Error, Result, srgb};
 
 /// File formats that meshes are written in.
@@ -37,7 +38,7 @@ impl MeshFormat {
             "ply" => Ok(MeshFormat::Ply),
             "obj" => Ok(MeshFormat::Obj),
             "glb" => Ok(MeshFormat::Glb),
-            _ => Err(output(
+            _ => Err(Error::output(
                 path,
                 format!("no mesh format is called '{extension}'"),
                 "name it .ply, .obj or .glb",
@@ -52,15 +53,15 @@ impl MeshFormat {
 /// `Output` if the extension is unknown, the folder is missing, or the file exists and `force` is not set.
 pub fn check_destination(path: &Path, force: bool) -> Result<MeshFormat> {
     let format = MeshFormat::of(path)?;
-    if !folder(path).is_dir() {
-        return Err(output(
+    if !folder_of(path).is_dir() {
+        return Err(Error::output(
             path,
             "its folder does not exist",
-            format!("mkdir -p {}", folder(path).display()),
+            format!("mkdir -p {}", folder_of(path).display()),
         ));
     }
     if path.is_dir() {
-        return Err(output(path, "is a folder", "name a file"));
+        return Err(Error::output(path, "is a folder", "name a file"));
     }
     if !force && path.symlink_metadata().is_ok() {
         return Err(exists(path));
@@ -83,7 +84,7 @@ pub fn write_mesh(path: &Path, mesh: &Mesh, force: bool) -> Result<()> {
         "one colour per vertex, or none"
     );
     if format == MeshFormat::Glb && glb_bytes(mesh) > u64::from(u32::MAX) {
-        return Err(output(
+        return Err(Error::output(
             path,
             format!(
                 "{} bytes do not fit the 4 GiB of a GLB file",
@@ -92,63 +93,28 @@ pub fn write_mesh(path: &Path, mesh: &Mesh, force: bool) -> Result<()> {
             "write a .ply",
         ));
     }
-    let failed = |source: std::io::Error| {
-        let next = if source.kind() == std::io::ErrorKind::StorageFull {
-            "free some space"
-        } else {
-            "check the folder's permissions"
-        };
-        output(path, format!("cannot be written: {source}"), next)
+    let write = |file: &mut File| {
+        let mut out = BufWriter::with_capacity(1 << 20, file);
+        match format {
+            MeshFormat::Ply => ply(&mut out, mesh),
+            MeshFormat::Obj => obj(&mut out, mesh),
+            MeshFormat::Glb => glb(&mut out, mesh),
+        }?;
+        out.flush()
     };
-    let mut builder = tempfile::Builder::new();
-    builder.prefix(".neurodin-").suffix(".part");
-    #[cfg(unix)]
-    builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666)); // less the umask, as for any other file
-    let file = builder.tempfile_in(folder(path)).map_err(failed)?;
-    let mut out = BufWriter::with_capacity(1 << 20, file.as_file());
-    match format {
-        MeshFormat::Ply => ply(&mut out, mesh),
-        MeshFormat::Obj => obj(&mut out, mesh),
-        MeshFormat::Glb => glb(&mut out, mesh),
-    }
-    .and_then(|()| out.flush())
-    .and_then(|()| out.get_ref().sync_all())
-    .map_err(failed)?;
-    drop(out);
-    let renamed = if force {
-        file.persist(path)
+    let written = if force {
+        whole_file::replace(path, write)
     } else {
-        file.persist_noclobber(path)
+        whole_file::create(path, write)
     };
-    renamed.map_err(|e| {
-        if e.error.kind() == std::io::ErrorKind::AlreadyExists {
-            exists(path)
-        } else {
-            failed(e.error)
-        }
-    })?;
-    // The name itself reaches the disk with its folder; not every system can sync one, and the file is complete either way.
-    let _ = File::open(folder(path)).and_then(|folder| folder.sync_all());
-    Ok(())
-}
-
-fn folder(path: &Path) -> &Path {
-    match path.parent() {
-        Some(folder) if folder != Path::new("") => folder,
-        _ => Path::new("."),
-    }
-}
-
-fn output(path: &Path, what: impl Into<String>, next: impl Into<String>) -> Error {
-    Error::Output {
-        path: path.to_path_buf(),
-        what: what.into(),
-        next: next.into(),
-    }
+    written.map_err(|error| match error.kind() {
+        ErrorKind::AlreadyExists => exists(path),
+        _ => Error::unwritable(path, &error),
+    })
 }
 
 fn exists(path: &Path) -> Error {
-    output(
+    Error::output(
         path,
         "exists already",
         "choose another name, or overwrite it with --force",
