@@ -90,7 +90,7 @@ pub(super) fn header(path: &Path) -> Result<Header> {
 fn decoder(path: &Path) -> Result<impl ImageDecoder> {
     let mut reader = ImageReader::open(path)
         .and_then(ImageReader::with_guessed_format)
-        .map_err(|source| Error::io(path, source))?;
+        .map_err(|error| Error::unreadable(path, &error))?;
     let mut limits = image::Limits::default();
     limits.max_alloc = Some(4 << 30);
     reader.limits(limits);

@@ -107,7 +107,7 @@ fn count_cameras(file: &Path, arrays: &Arrays) -> Result<usize> {
 
 /// The pictures in a folder, sorted by name.
 fn pictures(folder: &Path) -> Result<Vec<PathBuf>> {
-    let entries = std::fs::read_dir(folder).map_err(|error| Error::io(folder, error))?;
+    let entries = std::fs::read_dir(folder).map_err(|error| Error::unreadable(folder, &error))?;
     let mut found: Vec<PathBuf> = entries
         .flatten()
         .map(|entry| entry.path())

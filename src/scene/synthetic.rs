@@ -294,7 +294,7 @@ impl SyntheticOptions {
     /// and how much there is.
     ///
     /// # Errors
-    /// [`Error::Output`] where `root` exists and is not an empty folder; [`Error::Io`] where something cannot be written.
+    /// [`Error::Output`] where `root` exists and is not an empty folder, or something cannot be written.
     pub fn write(
         &self,
         root: &Path,
@@ -303,24 +303,21 @@ impl SyntheticOptions {
         let occupied =
             fs::read_dir(root).map_or(root.exists(), |mut entries| entries.next().is_some());
         if occupied {
-            return Err(Error::Output {
-                path: root.to_path_buf(),
-                what: "exists already".into(),
-                next: "remove it, or name another folder".into(),
-            });
+            let next = "remove it, or name another folder";
+            return Err(Error::output(root, "exists already", next));
         }
         let parent = root
             .parent()
             .filter(|p| !p.as_os_str().is_empty())
             .unwrap_or(Path::new("."));
-        fs::create_dir_all(parent).map_err(|e| Error::io(parent, e))?;
+        fs::create_dir_all(parent).map_err(|e| Error::unwritable(parent, &e))?;
         let staging = tempfile::Builder::new()
             .prefix(".dataset-")
             .tempdir_in(parent)
-            .map_err(|e| Error::io(parent, e))?;
+            .map_err(|e| Error::unwritable(parent, &e))?;
         for folder in ["images", "ground_truth"] {
             let path = staging.path().join(folder);
-            fs::create_dir(&path).map_err(|e| Error::io(path, e))?;
+            fs::create_dir(&path).map_err(|e| Error::unwritable(path, &e))?;
         }
 
         let (train, test) = (self.train(), self.test());
@@ -336,27 +333,27 @@ impl SyntheticOptions {
                 self.height,
                 image::ExtendedColorType::Rgb8,
             )
-            .map_err(|e| Error::io(path, std::io::Error::other(e)))?;
+            .map_err(|e| Error::unwritable(path, &e))?;
         }
         progress("rendering photographs", total, total);
         for (name, views) in [("transforms.json", &train), ("transforms_test.json", &test)] {
             let path = staging.path().join(name);
             let text = format!("{:#}\n", self.transforms(views));
-            fs::write(&path, text).map_err(|e| Error::io(path, e))?;
+            fs::write(&path, text).map_err(|e| Error::unwritable(path, &e))?;
         }
 
         progress("sampling the exact surface", 0, 1);
         let points = self.reference();
         let inside = Path::new("ground_truth").join("surface.ply");
         let path = staging.path().join(&inside);
-        write_points(&path, &points).map_err(|e| Error::io(path, e))?;
+        write_points(&path, &points).map_err(|e| Error::unwritable(path, &e))?;
         progress("sampling the exact surface", 1, 1);
 
         let staged = staging.keep();
         fs::rename(&staged, root).map_err(|e| {
             // What cannot be moved is of no use; the error that matters is the rename's.
             let _ = fs::remove_dir_all(&staged);
-            Error::io(root, e)
+            Error::unwritable(root, &e)
         })?;
         Ok(SyntheticDataset {
             root: root.to_path_buf(),
