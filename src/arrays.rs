@@ -35,19 +35,19 @@ pub(crate) struct Array<T> {
 impl Arrays {
     /// Opens an .npz or .npy file.
     pub fn open(file: &Path) -> Result<Arrays> {
-        let io = |source| Error::io(file, source);
+        let unreadable = |error| Error::unreadable(file, &error);
         let extension = file.extension().unwrap_or_default().to_ascii_lowercase();
         let source = match extension.to_str() {
             Some("npz") => {
-                let open = File::open(file).map_err(io)?;
-                let size = open.metadata().map_err(io)?.len();
+                let open = File::open(file).map_err(unreadable)?;
+                let size = open.metadata().map_err(unreadable)?.len();
                 let archive = ZipArchive::new(BufReader::new(open)).map_err(|error| {
                     let what = format!("is no .npz archive ({size} bytes): {error}");
                     Error::input(file, what, NEXT)
                 })?;
                 Source::Archive(archive)
             }
-            Some("npy") => Source::Single(std::fs::read(file).map_err(io)?),
+            Some("npy") => Source::Single(std::fs::read(file).map_err(unreadable)?),
             Some("mat") => {
                 return Err(Error::input(
                     file,

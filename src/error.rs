@@ -41,12 +41,6 @@ pub enum Error {
     /// Stopped on request, after what was done had been saved.
     #[error("{what}")]
     Interrupted { what: String },
-    /// A file operation that failed for the operating system's reason.
-    #[error("{path}: {source}", path = path.display())]
-    Io {
-        path: PathBuf,
-        source: std::io::Error,
-    },
     /// A Vulkan call that returned what it should not.
     #[error("{call} failed: {code}")]
     Vulkan { call: &'static str, code: String },
@@ -62,9 +56,9 @@ impl Error {
         }
     }
 
-    /// An input file that cannot be read.
+    /// An input file or folder that cannot be read.
     pub fn unreadable(path: impl AsRef<Path>, error: &std::io::Error) -> Self {
-        let next = "name a file that is there and may be read";
+        let next = "see that it is there and may be read, or name another";
         Error::input(path, format!("cannot be read: {error}"), next)
     }
 
@@ -81,12 +75,10 @@ impl Error {
         }
     }
 
-    /// A failed file operation on `path`.
-    pub fn io(path: impl AsRef<Path>, source: std::io::Error) -> Self {
-        Error::Io {
-            path: path.as_ref().to_path_buf(),
-            source,
-        }
+    /// An output that cannot be written, made, or cleared away.
+    pub fn unwritable(path: impl AsRef<Path>, error: &dyn std::fmt::Display) -> Self {
+        let next = "make room or mend the permissions there, or name another place";
+        Error::output(path, format!("cannot be written: {error}"), next)
     }
 
     /// The process exit code for this error.
@@ -99,7 +91,7 @@ impl Error {
             Error::Numerical { .. } => 7,
             Error::Output { .. } => 8,
             Error::Interrupted { .. } => 130,
-            Error::Io { .. } | Error::Vulkan { .. } => 1,
+            Error::Vulkan { .. } => 1,
         }
     }
 }

@@ -14,8 +14,12 @@ pub mod kernels;
 pub mod mesh;
 pub mod model;
 pub mod picture;
+mod ply;
+mod random;
 pub mod render;
 pub mod scene;
+mod srgb;
 pub mod train;
+mod whole_file;
 
 pub use error::{Error, Result};

@@ -297,7 +297,8 @@ fn what_is_no_checkpoint_of_ours_is_named() {
 fn a_full_disk_is_reported_and_costs_nothing() {
     let folder = tempfile::tempdir().unwrap();
     save(folder.path(), 10, &tensors()).unwrap();
-    let part = folder.path().join("step-00000020.safetensors.part");
+    let part = format!("step-00000020.safetensors.{}.part", std::process::id());
+    let part = folder.path().join(part);
     std::os::unix::fs::symlink("/dev/full", &part).unwrap();
     match save(folder.path(), 20, &tensors()) {
         Err(error @ Error::Output { .. }) => {

@@ -157,6 +157,10 @@ fn an_output_that_exists_is_left_alone() {
     let error = small().write(folder.path(), &mut |_, _, _| ()).unwrap_err();
     assert!(matches!(error, Error::Output { .. }), "{error}");
     assert_eq!(contents(folder.path()).len(), 1);
+    // Nor is there a place below a file.
+    let below = folder.path().join("mine.txt/dataset");
+    let error = small().write(&below, &mut |_, _, _| ()).unwrap_err();
+    assert!(matches!(error, Error::Output { .. }), "{error}");
 }
 
 #[test]

@@ -4,9 +4,10 @@ use clap::Parser;
 use glam::{DMat4, DVec2, DVec3};
 use neurodin::Error;
 use neurodin::cli::eval::{EvalArgs, score_mesh};
-use neurodin::eval::{GeometryOptions, GeometryScores, Reference, psnr, score_geometry, ssim};
+use neurodin::eval::{
+    GeometryOptions, GeometryScores, Reference, Viewpoint, psnr, score_geometry, ssim,
+};
 use neurodin::mesh::bvh::{Bvh, Triangle};
-use neurodin::mesh::visibility::Viewpoint;
 use neurodin::mesh::{Mesh, write_mesh};
 
 /// A repeatable stream of numbers in [0, 1).
@@ -413,6 +414,38 @@ fn only_what_cameras_see_counts() {
     assert_eq!((seen.accuracy.mean, seen.chamfer), (None, None));
     assert!(near(seen.chamfer_trimmed, twice.trim, 1e-12));
     assert!(seen.thresholds.iter().all(|at| at.f_score == 0.0));
+    // Behind the camera, which looks from 4 towards smaller x, there is as little.
+    let mut behind = outer;
+    for p in &mut behind.positions {
+        p.x += 8.0;
+    }
+    let seen = score_geometry(&behind, &reference, Some(&views[..1]), &options()).unwrap();
+    assert_eq!((seen.accuracy.points, seen.faces_scored), (0, 0));
+}
+
+#[test]
+fn a_large_triangle_hides_although_its_corners_are_out_of_sight() {
+    let ball = globe(1.0, 8);
+    let mut mesh = Mesh {
+        positions: vec![
+            DVec3::new(2.0, -50.0, -50.0),
+            DVec3::new(2.0, 50.0, -50.0),
+            DVec3::new(2.0, 0.0, 50.0),
+        ],
+        faces: vec![[0, 1, 2]],
+        ..Default::default()
+    };
+    mesh.positions.extend(&ball.positions);
+    mesh.faces
+        .extend(ball.faces.iter().map(|face| face.map(|v| v + 3)));
+    let reference = Reference::from_mesh(ball);
+    let scored = |eye| {
+        score_geometry(&mesh, &reference, Some(&[OnAxis(eye)]), &options())
+            .unwrap()
+            .faces_scored
+    };
+    assert_eq!(scored(4.0), 1, "the wall alone");
+    assert!(scored(-4.0) > 10, "from the other side the ball is seen");
 }
 
 #[test]

@@ -1,13 +1,12 @@
-//! Meshes on disk and their cleaning: round trips, refusals, hostile files, components, crops, what cameras see.
+//! Meshes on disk and their cleaning: round trips, refusals, hostile files, components.
 
 use std::fs;
 use std::path::Path;
 use std::sync::OnceLock;
 
-use glam::{DMat4, DVec2, DVec3};
+use glam::DVec3;
 use neurodin::Error;
-use neurodin::mesh::clean::{components, crop, cull_unseen, drop_small, keep_largest};
-use neurodin::mesh::visibility::{Viewpoint, VisibilityOptions};
+use neurodin::mesh::clean::{components, drop_small, keep_largest};
 use neurodin::mesh::{Mesh, read_mesh, write_mesh};
 use proptest::prelude::*;
 use serde_json::Value;
@@ -328,6 +327,13 @@ fn ply_of_other_programs() {
         mesh
     );
 
+    // Lines that say nothing of the values, and lists among a vertex's numbers.
+    let odd = ASCII
+        .replace("comment", "made by some program\nobj_info none\n\ncomment")
+        .replace("float quality", "list uchar int seen_by")
+        .replace(" 0.5 ", " 2 7 8 ");
+    assert_eq!(parse("d.ply", odd.as_bytes()).unwrap(), mesh);
+
     let mut big = b"ply\nformat binary_big_endian 1.0\nelement vertex 3\nproperty short x\nproperty double y\nproperty float z\n\
         property float red\nproperty float green\nproperty float blue\nelement face 1\nproperty list uint ushort vertex_index\nend_header\n"
         .to_vec();
@@ -393,6 +399,25 @@ fn damaged_files_are_refused() {
         assert!(
             matches!(parse("a.obj", text.as_bytes()), Err(Error::Input { .. })),
             "{text:?}"
+        );
+    }
+    // What is wrong is said with its place and numbers.
+    for (from, to, said) in [
+        (
+            "vertex 4",
+            "vertex 40",
+            "promises 40 of 'vertex' of at least 14 bytes each",
+        ),
+        ("0 1\n", "0\n \n", "ends within edge 0 of 1"),
+        ("4 5 6", "4 e 6", "'e' is not a number"),
+        ("float quality", "quaternion quality", "'quaternion'"),
+        ("face 2", "face two", "'element face two' has no count"),
+    ] {
+        assert!(ASCII.contains(from));
+        let error = parse("a.ply", ASCII.replacen(from, to, 1).as_bytes()).unwrap_err();
+        assert!(
+            error.to_string().contains(said),
+            "{from:?} → {to:?}: {error}"
         );
     }
     assert!(matches!(parse("a.stl", b"solid"), Err(Error::Input { .. })));
@@ -489,127 +514,7 @@ fn components_are_counted_and_chosen() {
     let mut two = mesh.clone();
     drop_small(&mut two, 128);
     assert!(two == merged(&parts[1..]));
-    let mut cropped = mesh.clone();
-    crop(
-        &mut cropped,
-        [DVec3::new(2.0, -2.0, -2.0), DVec3::new(6.0, 2.0, 2.0)],
-    );
-    assert!(cropped == parts[1]);
-    crop(&mut cropped, [DVec3::splat(50.0), DVec3::splat(60.0)]);
-    assert!(cropped == Mesh::default());
-    keep_largest(&mut cropped);
-    assert!(cropped == Mesh::default());
-}
-
-/// A pinhole camera at `eye` that looks at `target`, 90 degrees wide.
-struct Pinhole {
-    eye: DVec3,
-    target: DVec3,
-    size: u32,
-}
-
-impl Viewpoint for Pinhole {
-    fn world_from_camera(&self) -> DMat4 {
-        DMat4::look_at_rh(self.eye, self.target, DVec3::new(0.1, 0.2, 1.0).normalize()).inverse()
-    }
-
-    fn size(&self) -> [u32; 2] {
-        [self.size; 2]
-    }
-
-    fn project(&self, p: DVec3) -> Option<DVec2> {
-        let half = f64::from(self.size) / 2.0;
-        (p.z < 0.0).then(|| DVec2::new(half - half * p.x / p.z, half + half * p.y / p.z))
-    }
-}
-
-#[test]
-fn what_no_camera_sees_is_culled() {
-    let shell = ball(DVec3::ZERO, 1.0, 24);
-    let views: Vec<Pinhole> = [
-        DVec3::X,
-        DVec3::NEG_X,
-        DVec3::Y,
-        DVec3::NEG_Y,
-        DVec3::Z,
-        DVec3::NEG_Z,
-    ]
-    .iter()
-    .map(|&side| Pinhole {
-        eye: 4.0 * side,
-        target: DVec3::ZERO,
-        size: 500,
-    })
-    .collect();
-    // A core inside of the shell is hidden, the shell itself is seen from all around.
-    let mut mesh = merged(&[ball(DVec3::ZERO, 0.8, 8), shell.clone()]);
-    cull_unseen(&mut mesh, &views, &VisibilityOptions::default());
-    assert!(mesh == shell);
-    // One camera sees the cap up to where its rays touch the ball, at x = 1/4; one pixel and one face more.
-    let mut mesh = shell.clone();
-    cull_unseen(&mut mesh, &views[..1], &VisibilityOptions::default());
-    let low = mesh
-        .positions
-        .iter()
-        .map(|p| p.x)
-        .fold(f64::INFINITY, f64::min);
-    assert!(
-        (0.0..0.25).contains(&low),
-        "faces are kept down to x = {low}"
-    );
-    let cap = mesh.area() / (2.0 * std::f64::consts::PI * 0.75);
-    assert!((1.0..1.2).contains(&cap), "{cap} of the cap's area");
-    let mut mesh = shell.clone();
-    cull_unseen(
-        &mut mesh,
-        &views,
-        &VisibilityOptions {
-            min_views: 4,
-            ..Default::default()
-        },
-    );
-    assert!(
-        mesh.faces.is_empty(),
-        "no face of a ball faces four of six sides"
-    );
-    // Outside of the picture, or behind the camera.
-    let mut mesh = shell;
-    let away = [Pinhole {
-        eye: DVec3::X * 4.0,
-        target: DVec3::X * 8.0,
-        size: 500,
-    }];
-    cull_unseen(&mut mesh, &away, &VisibilityOptions::default());
-    assert!(mesh.faces.is_empty());
-}
-
-#[test]
-fn a_large_triangle_hides_although_its_corners_are_out_of_sight() {
-    let far = 50.0;
-    let wall = Mesh {
-        positions: vec![
-            DVec3::new(2.0, -far, -far),
-            DVec3::new(2.0, far, -far),
-            DVec3::new(2.0, 0.0, far),
-        ],
-        faces: vec![[0, 1, 2]],
-        ..Default::default()
-    };
-    let mut small = ball(DVec3::ZERO, 1.0, 8);
-    (small.normals, small.colors) = (vec![], vec![]);
-    let mut mesh = merged(&[wall.clone(), small]);
-    let view = [Pinhole {
-        eye: DVec3::X * 4.0,
-        target: DVec3::ZERO,
-        size: 100,
-    }];
-    cull_unseen(
-        &mut mesh,
-        &view,
-        &VisibilityOptions {
-            slack: 1e-3,
-            ..Default::default()
-        },
-    );
-    assert!(mesh == wall);
+    let mut nothing = Mesh::default();
+    keep_largest(&mut nothing);
+    assert!(nothing == Mesh::default());
 }

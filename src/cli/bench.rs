@@ -113,13 +113,8 @@ pub(super) fn run(args: &BenchArgs, context: &Context) -> anyhow::Result<()> {
         "dictionary": dictionary,
     });
     if let Some(path) = &args.out {
-        std::fs::write(path, format!("{result:#}\n")).map_err(|error| {
-            Error::output(
-                path,
-                format!("cannot be written: {error}"),
-                "make room there",
-            )
-        })?;
+        std::fs::write(path, format!("{result:#}\n"))
+            .map_err(|error| Error::unwritable(path, &error))?;
     }
     Ok(context.result(&result, "")?)
 }
@@ -293,14 +288,8 @@ fn with_rays(config: Config, rays: Option<u32>) -> Config {
 
 /// Reads a result that `--out` wrote.
 fn read(path: &Path) -> Result<Value> {
-    let text = std::fs::read_to_string(path).map_err(|error| {
-        Error::input(
-            path,
-            format!("cannot be read: {error}"),
-            "name a file that `neurodin bench --out` wrote",
-        )
-    })?;
-    serde_json::from_str(&text)
+    let data = std::fs::read(path).map_err(|error| Error::unreadable(path, &error))?;
+    serde_json::from_slice(&data)
         .ok()
         .filter(|value: &Value| value["presets"].is_array())
         .ok_or_else(|| {

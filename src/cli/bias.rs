@@ -197,14 +197,12 @@ fn compare(
         draw(&counts, limit, &mut text);
         let mut pictures = Vec::new();
         if let Some(out) = &args.out {
-            std::fs::create_dir_all(out).map_err(|e| Error::io(out.clone(), e))?;
+            std::fs::create_dir_all(out).map_err(|e| Error::unwritable(out, &e))?;
             for view in &of.views {
                 let path = out.join(format!("{}.{}.bias.png", view.name, of.name));
-                let failed =
-                    |e| Error::output(&path, format!("cannot be written: {e}"), "make room there");
                 picture(&view.distances, view.size, limit)
                     .save(&path)
-                    .map_err(failed)?;
+                    .map_err(|error| Error::unwritable(&path, &error))?;
                 pictures.push(path);
             }
         }

@@ -113,13 +113,7 @@ pub(super) fn run(args: &CompareArgs, context: &Context) -> anyhow::Result<()> {
         context.say("\npictures");
         let pictures = pictures(args, &methods)?;
         let html = report::html(&table, &pictures, &args.dataset.display().to_string());
-        fs::write(path, html).map_err(|error| {
-            Error::output(
-                path,
-                format!("cannot be written: {error}"),
-                "make room there",
-            )
-        })?;
+        fs::write(path, html).map_err(|error| Error::unwritable(path, &error))?;
         files.push(path);
     }
     let result = json!({ "methods": table.to_json(), "report": files.first() });
@@ -224,7 +218,7 @@ fn score_mesh(args: &CompareArgs, mesh: &Path) -> Result<Value> {
 /// Mean over the log's lines, which stand at equal distances in steps, also where the run was interrupted.
 fn seconds_per_step(run: &Path) -> Result<f64> {
     let path = RunDirectory::open(run)?.log();
-    let log = fs::read_to_string(&path).map_err(|e| Error::io(path.clone(), e))?;
+    let log = fs::read_to_string(&path).map_err(|e| Error::unreadable(&path, &e))?;
     let lines = log.lines().map(serde_json::from_str::<Value>);
     let rates: Vec<f64> = lines
         .filter_map(|line| line.ok()?["it_per_s"].as_f64())

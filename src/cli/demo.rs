@@ -169,11 +169,11 @@ impl<'c> Demo<'c> {
             for entry in [DATASET, RUN, PICTURES] {
                 let path = out.join(entry);
                 if path.exists() {
-                    fs::remove_dir_all(&path).map_err(|e| Error::io(path, e))?;
+                    fs::remove_dir_all(&path).map_err(|e| Error::unwritable(path, &e))?;
                 }
             }
         }
-        fs::create_dir_all(out).map_err(|e| Error::io(out, e))?;
+        fs::create_dir_all(out).map_err(|e| Error::unwritable(out, &e))?;
         Ok(Demo {
             args,
             context,
@@ -351,7 +351,7 @@ impl<'c> Demo<'c> {
 
     fn log(&self) -> Result<String> {
         let path = RunDirectory::open(&self.args.out.join(RUN))?.log();
-        fs::read_to_string(&path).map_err(|e| Error::io(path, e))
+        fs::read_to_string(&path).map_err(|e| Error::unreadable(path, &e))
     }
 
     /// Writes the pictures, `scores.json` and `report.html`, and says what came out.
@@ -367,7 +367,7 @@ impl<'c> Demo<'c> {
 
         let page = out.join("report.html");
         let folder = out.join(PICTURES);
-        fs::create_dir_all(&folder).map_err(|e| Error::io(&folder, e))?;
+        fs::create_dir_all(&folder).map_err(|e| Error::unwritable(&folder, &e))?;
         for (name, picture) in pictures.named() {
             write_file(&folder.join(name), &picture.png())?;
         }
@@ -429,11 +429,5 @@ fn scores(
 }
 
 fn write_file(path: &Path, bytes: &[u8]) -> Result<()> {
-    fs::write(path, bytes).map_err(|error| {
-        Error::output(
-            path,
-            format!("cannot be written: {error}"),
-            "make room or mend the permissions there",
-        )
-    })
+    fs::write(path, bytes).map_err(|error| Error::unwritable(path, &error))
 }

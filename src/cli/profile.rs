@@ -127,11 +127,5 @@ fn write_trace(path: &Path, profile: &Profile, device: &str) -> Result<()> {
         writeln!(file, "\n]}}")?;
         file.flush()
     };
-    write().map_err(|error| {
-        Error::output(
-            path,
-            format!("cannot be written: {error}"),
-            "make room or mend the permissions there",
-        )
-    })
+    write().map_err(|error| Error::unwritable(path, &error))
 }

@@ -5,6 +5,7 @@ use super::{Context, interrupt};
 use crate::config::AppearanceAtEval;
 use crate::render::Rendered;
 use crate::scene::{Camera, Scene, Split};
+use crate::srgb::byte;
 use crate::train::run_directory::RunDirectory;
 use crate::train::trained::Trained;
 use crate::{Error, Result};
@@ -240,14 +241,6 @@ fn write(
         name.push(ending);
         PathBuf::from(name)
     };
-    let failed = |path: &Path, error: &dyn std::fmt::Display| {
-        Error::output(
-            path,
-            format!("cannot be written: {error}"),
-            "make room or mend the permissions there",
-        )
-    };
-    let byte = |value: f32| (value.clamp(0.0, 1.0) * 255.0).round() as u8;
     let at = |x: u32, y: u32| (y * width + x) as usize;
     match what {
         What::Rgb => {
@@ -256,7 +249,7 @@ fn write(
                 image::Rgb(rendered.rgb[at(x, y)].map(byte))
             })
             .save(&path)
-            .map_err(|error| failed(&path, &error))?;
+            .map_err(|error| Error::unwritable(&path, &error))?;
             Ok(vec![path])
         }
         What::Depth => {
@@ -268,7 +261,7 @@ fn write(
             Image::from_encoded_channels(size, Encoding::FAST_LOSSLESS, channels)
                 .write()
                 .to_file(&exr)
-                .map_err(|error| failed(&exr, &error))?;
+                .map_err(|error| Error::unwritable(&exr, &error))?;
             let there = depths.iter().copied().filter(|depth| *depth > 0.0);
             let (near, far) = there.fold((f32::INFINITY, 0.0f32), |(near, far), depth| {
                 (near.min(depth), far.max(depth))
@@ -281,7 +274,7 @@ fn write(
                 }])
             })
             .save(&png)
-            .map_err(|error| failed(&png, &error))?;
+            .map_err(|error| Error::unwritable(&png, &error))?;
             Ok(vec![exr, png])
         }
         What::Normal => {
@@ -297,12 +290,12 @@ fn write(
             Image::from_encoded_channels(size, Encoding::FAST_LOSSLESS, channels)
                 .write()
                 .to_file(&exr)
-                .map_err(|error| failed(&exr, &error))?;
+                .map_err(|error| Error::unwritable(&exr, &error))?;
             RgbImage::from_fn(width, height, |x, y| {
                 image::Rgb(rendered.normal[at(x, y)].map(|n| byte(0.5 + 0.5 * n)))
             })
             .save(&png)
-            .map_err(|error| failed(&png, &error))?;
+            .map_err(|error| Error::unwritable(&png, &error))?;
             Ok(vec![exr, png])
         }
     }

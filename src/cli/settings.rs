@@ -71,13 +71,8 @@ impl SettingsArgs {
         }
         if let Some(path) = &self.config {
             let source = path.display().to_string();
-            let text = std::fs::read_to_string(path).map_err(|error| {
-                Error::input(
-                    path,
-                    format!("cannot be read: {error}"),
-                    "name a TOML file, as `neurodin train --print-config` writes it",
-                )
-            })?;
+            let text =
+                std::fs::read_to_string(path).map_err(|error| Error::unreadable(path, &error))?;
             config = match &self.preset {
                 // Its own preset counts unless another was asked for.
                 None => Config::from_toml_or(&text, &source, config)?,

@@ -166,7 +166,7 @@ fn cameras_in_matter(config: &Config, scene: &Scene, region: &Region) -> Option<
     if !config.surface.inside_out {
         return None;
     }
-    let region_from_world = region.world_from_region().inverse();
+    let region_from_world = region.region_from_world();
     let position = |view: usize| {
         let camera = scene.views[view].world_from_camera.w_axis.truncate();
         region_from_world.transform_point3(camera).length()

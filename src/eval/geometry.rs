@@ -14,9 +14,9 @@ use rayon::prelude::*;
 use serde::Serialize;
 
 use crate::mesh::bvh::{Bvh, Triangle};
-use crate::mesh::visibility::Viewpoint;
 use crate::mesh::{Mesh, bounds};
-use crate::{Error, Result};
+use crate::scene::View;
+use crate::{Error, Result, random};
 
 /// How to score.
 #[derive(Clone, Debug)]
@@ -335,6 +335,30 @@ fn surface_samples<V: Viewpoint>(
     (kept.into_iter().map(|(p, _)| p).collect(), scored)
 }
 
+/// A camera as far as seeing is concerned.
+pub trait Viewpoint: Sync {
+    /// Rigid; the camera looks along its −z.
+    fn world_from_camera(&self) -> DMat4;
+    /// Width and height in pixels.
+    fn size(&self) -> [u32; 2];
+    /// Pixel (centres at +0.5) of a point in the camera's frame; `None` if no pixel can show it. May lie outside the image.
+    fn project(&self, p_camera: DVec3) -> Option<DVec2>;
+}
+
+impl Viewpoint for View {
+    fn world_from_camera(&self) -> DMat4 {
+        self.world_from_camera
+    }
+
+    fn size(&self) -> [u32; 2] {
+        [self.camera.width, self.camera.height]
+    }
+
+    fn project(&self, p_camera: DVec3) -> Option<DVec2> {
+        self.camera.project(p_camera)
+    }
+}
+
 /// A view with what is asked of it most.
 struct Eye<'a, V: Viewpoint> {
     view: &'a V,
@@ -421,20 +445,13 @@ fn draw_uncropped(mesh: &Mesh, faces: &[usize], n: usize, seed: u64) -> Vec<(DVe
 /// Three numbers in [0, 1) that depend on nothing but (seed, index).
 fn uniforms(seed: u64, index: u64) -> [f64; 3] {
     std::array::from_fn(|i| {
-        let bits = mixed(seed, index.wrapping_mul(3).wrapping_add(i as u64));
-        (bits >> 11) as f64 / (1u64 << 53) as f64
+        let nth = index.wrapping_mul(3).wrapping_add(i as u64);
+        random::unit(mixed(seed, nth))
     })
 }
 
-/// Bits that depend on nothing but (seed, index): SplitMix64 (Steele, Lea & Flood 2014).
+/// Bits that depend on nothing but (seed, index).
 pub(super) fn mixed(seed: u64, index: u64) -> u64 {
-    let mix = |x: u64| {
-        let x = (x ^ (x >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        let x = (x ^ (x >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        x ^ (x >> 31)
-    };
-    let start = mix(seed.wrapping_mul(0x9e37_79b9_7f4a_7c15));
-    mix(start
-        .wrapping_add(index)
-        .wrapping_mul(0x9e37_79b9_7f4a_7c15))
+    let start = random::mix(seed.wrapping_mul(random::STEP));
+    random::mix(start.wrapping_add(index).wrapping_mul(random::STEP))
 }

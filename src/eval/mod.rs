@@ -7,5 +7,5 @@ pub mod geometry;
 pub mod images;
 pub mod tanks;
 
-pub use geometry::{GeometryOptions, GeometryScores, Reference, score_geometry};
+pub use geometry::{GeometryOptions, GeometryScores, Reference, Viewpoint, score_geometry};
 pub use images::{psnr, ssim};

@@ -30,7 +30,7 @@ pub struct GpuOptions {
     /// Ignores what only some devices offer, so that the variants run that run everywhere.
     pub portable: bool,
     /// Adds gradients up so that their order does not count: the same run comes out in the same bits, on one device. Needs 64-bit
-    /// atomics, which `portable` leaves alone.
+    /// atomics, which `portable` leaves out.
     pub deterministic: bool,
     /// How wide layers and networks are multiplied.
     pub matrices: Matrices,
@@ -119,6 +119,9 @@ impl Gpu {
         let chosen = choose(&devices, options.device.as_deref())?;
         let offered = devices.len();
         let (physical, mut info) = devices.into_iter().nth(chosen).expect("chosen from these");
+        // What the device has, before what is not to be used of it is taken away.
+        let has_matrix = info.matrix.is_some();
+        let has_int64 = info.int64 && info.int64_atomics;
         if options.portable {
             info.float_atomics = false;
             info.int64 = false;
@@ -126,23 +129,31 @@ impl Gpu {
             info.full_subgroups = None;
             info.matrix = None;
         }
-        if info.matrix.is_none() && options.matrices.is_demanded() {
-            return Err(Error::NoDevice {
-                what: format!(
-                    "{} has no cooperative matrices of float16 with float32 sums, which matrices = \"compensated\" and \"float16\" need
-  next: set it to \"auto\", or choose another device",
+        let lacking = |has: bool, what: &str, next: &str| Error::NoDevice {
+            what: match has {
+                true => format!(
+                    "GpuOptions::portable leaves out {what}\n  next: {next}, or open {} without portable",
                     info.name
                 ),
-            });
+                false => format!(
+                    "{} has no {what}\n  next: {next}, or choose another device",
+                    info.name
+                ),
+            },
+        };
+        if info.matrix.is_none() && options.matrices.is_demanded() {
+            return Err(lacking(
+                has_matrix,
+                "cooperative matrices of float16 with float32 sums, which matrices = \"compensated\" and \"float16\" need",
+                "set it to \"auto\"",
+            ));
         }
         if options.deterministic && !(info.int64 && info.int64_atomics) {
-            return Err(Error::NoDevice {
-                what: format!(
-                    "{} adds no 64-bit integers atomically, which deterministic training needs
-  next: train without --deterministic, or on another device",
-                    info.name
-                ),
-            });
+            return Err(lacking(
+                has_int64,
+                "64-bit integers with atomic addition, which deterministic training needs",
+                "train without --deterministic",
+            ));
         }
         tracing::info!(
             device = info.name,
@@ -352,7 +363,9 @@ pub(super) fn vulkan(call: &'static str) -> impl Fn(vk::Result) -> Error {
         },
         vk::Result::ERROR_OUT_OF_DEVICE_MEMORY | vk::Result::ERROR_OUT_OF_HOST_MEMORY => {
             Error::OutOfMemory {
-                what: format!("{call}: {code}"),
+                what: format!(
+                    "{call}: {code}\n  next: close what else uses memory, or ask for less"
+                ),
             }
         }
         code => Error::Vulkan {

@@ -2,10 +2,11 @@
 
 use super::device::{Context, Gpu, GpuOptions, vulkan};
 use super::instance::DeviceInfo;
-use crate::{Error, Result};
+use crate::{Error, Result, whole_file};
 use ash::vk;
 use bytemuck::Pod;
 use std::collections::HashMap;
+use std::io::Write;
 use std::marker::PhantomData;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
@@ -177,7 +178,7 @@ impl Pipelines {
         })
     }
 
-    /// Writes the cache where it has grown: first beside its place, then into it, so that a reader never meets half a file.
+    /// Writes the cache where it has grown.
     fn save(&self) -> Result<()> {
         let Some((file, known)) = &self.cache_file else {
             return Ok(());
@@ -189,11 +190,9 @@ impl Pipelines {
             return Ok(());
         }
         let folder = file.parent().expect("the file lies in the cache's folder");
-        let failed = |error| Error::io(file, error);
-        std::fs::create_dir_all(folder).map_err(failed)?;
-        let beside = file.with_extension(format!("{}.part", std::process::id()));
-        std::fs::write(&beside, &data).map_err(failed)?;
-        std::fs::rename(&beside, file).map_err(failed)?;
+        std::fs::create_dir_all(folder)
+            .and_then(|()| whole_file::replace(file, |out| out.write_all(&data)))
+            .map_err(|error| Error::unwritable(file, &error))?;
         tracing::info!(file = %file.display(), bytes = data.len(), "pipeline cache written");
         Ok(())
     }
@@ -263,7 +262,7 @@ impl Pipelines {
         let built = if invocations > info.max_workgroup {
             Err(Error::NoDevice {
                 what: format!(
-                    "kernel {} has workgroups of {invocations}, {} ends at {}",
+                    "kernel {} has workgroups of {invocations}, {} ends at {}\n  next: choose another device",
                     module.name, info.name, info.max_workgroup
                 ),
             })

@@ -168,7 +168,9 @@ impl Memory {
             allocation_sizes: Default::default(),
         });
         let allocator = allocator.map_err(|error| Error::OutOfMemory {
-            what: format!("the allocator did not start: {error}"),
+            what: format!(
+                "the allocator did not start: {error}\n  next: close what else uses the device, or choose another"
+            ),
         })?;
         Ok(Memory {
             allocator: Mutex::new(ManuallyDrop::new(allocator)),

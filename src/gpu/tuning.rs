@@ -3,10 +3,11 @@
 use super::device::Gpu;
 use super::kernel::cache_name;
 use super::recorder::Recorder;
-use crate::{Error, Result, kernels};
+use crate::{Result, kernels, whole_file};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::hash::{DefaultHasher, Hash, Hasher};
+use std::io::Write;
 use std::path::PathBuf;
 use std::sync::Mutex;
 
@@ -61,20 +62,17 @@ impl Tuning {
         }
     }
 
-    fn save(&self, answers: &Answers) -> Result<()> {
+    fn save(&self, answers: &Answers) -> std::io::Result<()> {
         let Some(file) = &self.file else {
             return Ok(());
         };
-        let failed = |error| Error::io(file, error);
-        std::fs::create_dir_all(file.parent().expect("a file in a folder")).map_err(failed)?;
+        std::fs::create_dir_all(file.parent().expect("a file in a folder"))?;
         let kept = Kept {
             kernels: kernels_at_hand(),
             answers: answers.clone(),
         };
-        let text = serde_json::to_string_pretty(&kept).expect("names are text");
-        let beside = file.with_extension(format!("{}.part", std::process::id()));
-        std::fs::write(&beside, text + "\n").map_err(failed)?;
-        std::fs::rename(&beside, file).map_err(failed)
+        let text = serde_json::to_string_pretty(&kept).expect("names are text") + "\n";
+        whole_file::replace(file, |out| out.write_all(text.as_bytes()))
     }
 }
 

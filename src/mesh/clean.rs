@@ -1,9 +1,6 @@
-//! Removing what nobody wants from a mesh: unused vertices, small components, what lies outside a box, what no camera sees.
-
-use glam::DVec3;
+//! Removing what nobody wants from a mesh: unused vertices and small components.
 
 use super::Mesh;
-use super::visibility::{Viewpoint, VisibilityOptions, seen_faces};
 
 /// Keeps the faces for which `keep` is true, and the vertices that they use; order is kept.
 pub fn keep_faces(mesh: &mut Mesh, mut keep: impl FnMut(usize) -> bool) {
@@ -85,25 +82,4 @@ pub fn keep_largest(mesh: &mut Mesh) {
 pub fn drop_small(mesh: &mut Mesh, min_faces: usize) {
     let (component, sizes) = components(mesh);
     keep_faces(mesh, |face| sizes[component[face] as usize] >= min_faces);
-}
-
-/// Keeps the faces that lie inside an axis-aligned box with all three corners.
-pub fn crop(mesh: &mut Mesh, [low, high]: [DVec3; 2]) {
-    let inside: Vec<bool> = mesh
-        .positions
-        .iter()
-        .map(|p| p.cmpge(low).all() && p.cmple(high).all())
-        .collect();
-    let faces = std::mem::take(&mut mesh.faces);
-    mesh.faces = faces
-        .into_iter()
-        .filter(|face| face.iter().all(|&vertex| inside[vertex as usize]))
-        .collect();
-    drop_unused_vertices(mesh);
-}
-
-/// Drops the faces that fewer than `min_views` of the views see.
-pub fn cull_unseen<V: Viewpoint>(mesh: &mut Mesh, views: &[V], options: &VisibilityOptions) {
-    let seen = seen_faces(mesh, views, options);
-    keep_faces(mesh, |face| seen[face]);
 }

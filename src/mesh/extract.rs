@@ -13,7 +13,7 @@ use glam::{DMat3, DMat4, DVec3, Vec3};
 use super::Mesh;
 use super::marching_cubes::{MAX_VERTICES, Marcher, OUTSIDE, Sink};
 use crate::scene::{Region, RegionShape};
-use crate::{Error, Result};
+use crate::{Error, Result, srgb};
 
 /// Signed distances on a regular lattice, in the region frame; positive in free space.
 pub trait Lattice {
@@ -165,7 +165,7 @@ pub fn extract_surface(
                 let last: [usize; 3] =
                     std::array::from_fn(|j| (first[j] + options.block).min(grid.cells[j]));
                 let (low, high) = (grid.at(first), grid.at(last));
-                if !meets(options.shape, low, high) || !sink.crop_meets(low, high) {
+                if !options.shape.meets_box(low, high) || !sink.crop_meets(low, high) {
                     stats.blocks_outside += 1;
                 } else if let Some(steepest) = options.steepest
                     && is_far_from_zero(field, low, high, steepest, &mut values)?
@@ -241,10 +241,7 @@ pub fn add_attributes(
             (points.len(), points.len()),
             "attributes per point"
         );
-        colors.extend(
-            rgb.iter()
-                .map(|rgb| rgb.map(|channel| (channel.clamp(0.0, 1.0) * 255.0).round() as u8)),
-        );
+        colors.extend(rgb.iter().map(|rgb| rgb.map(srgb::byte)));
         normals.extend(
             gradients
                 .iter()
@@ -338,29 +335,6 @@ fn not_finite(
     }
 }
 
-fn half_extents(shape: RegionShape) -> DVec3 {
-    match shape {
-        RegionShape::Sphere => DVec3::ONE,
-        RegionShape::Box { half } => half,
-    }
-}
-
-/// Whether a point of the region frame belongs to the region.
-fn contains(shape: RegionShape, p: DVec3) -> bool {
-    match shape {
-        RegionShape::Sphere => p.length_squared() <= 1.0,
-        RegionShape::Box { half } => p.abs().cmple(half).all(),
-    }
-}
-
-/// Whether a box of the region frame has a point in common with the region.
-fn meets(shape: RegionShape, low: DVec3, high: DVec3) -> bool {
-    match shape {
-        RegionShape::Sphere => DVec3::ZERO.clamp(low, high).length_squared() <= 1.0,
-        RegionShape::Box { half } => low.cmple(half).all() && high.cmpge(-half).all(),
-    }
-}
-
 /// Whether no point between `low` and `high` can be zero if the field's slope is at most `steepest`: true if at the centre of each of
 /// `PROBES`³ sub-blocks the value is larger than what the way to its corner can undo.
 fn is_far_from_zero(
@@ -411,7 +385,7 @@ struct Grid {
 
 impl Grid {
     fn new(options: &ExtractOptions) -> Result<Grid> {
-        let half = half_extents(options.shape);
+        let half = options.shape.half_extents();
         let config = |what: String| Err(Error::Config { what });
         if !(half.is_finite() && half.min_element() > 0.0) {
             return config(format!("the region's half extents {half} must be positive"));
@@ -523,7 +497,7 @@ impl<'a> BlockSink<'a> {
                 .crop
                 .is_some_and(|[low, high]| world.cmplt(low).any() || world.cmpgt(high).any())
         };
-        if !contains(self.options.shape, position)
+        if !self.options.shape.contains(position)
             || cropped()
             || self.mesh.positions.len() >= MAX_VERTICES
         {

@@ -9,7 +9,6 @@ pub mod extract;
 pub mod field;
 pub mod marching_cubes;
 pub mod read;
-pub mod visibility;
 pub mod write;
 
 use glam::DVec3;

@@ -1,17 +1,19 @@
 //! Writing meshes: binary PLY, OBJ, and GLB (glTF 2.0), chosen by the file's extension.
 //!
-//! A file appears whole or not at all: it is written beside its destination, synced and renamed. Colours are sRGB bytes in PLY
-//! (`red green blue`), sRGB fractions after the position in OBJ, and linear 16-bit `COLOR_0` in GLB, as its specification wants.
+//! A file appears whole or not at all. Colours are sRGB bytes in PLY (`red green blue`), sRGB fractions after the position in OBJ, and
+//! linear 16-bit `COLOR_0` in GLB, as its specification wants.
 
 use std::fs::File;
-use std::io::{BufWriter, Write};
+use std::io::{BufWriter, ErrorKind, Write};
 use std::path::Path;
 
 use glam::DVec3;
 use serde_json::json;
 
 use super::{Mesh, bounds};
-use crate::{Error, Result};
+use crate::ply::{self, Element, Scalar};
+use crate::whole_file::{self, folder_of};
+use crate::{Error, Result, srgb};
 
 /// File formats that meshes are written in.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -36,7 +38,7 @@ impl MeshFormat {
             "ply" => Ok(MeshFormat::Ply),
             "obj" => Ok(MeshFormat::Obj),
             "glb" => Ok(MeshFormat::Glb),
-            _ => Err(output(
+            _ => Err(Error::output(
                 path,
                 format!("no mesh format is called '{extension}'"),
                 "name it .ply, .obj or .glb",
@@ -51,15 +53,15 @@ impl MeshFormat {
 /// `Output` if the extension is unknown, the folder is missing, or the file exists and `force` is not set.
 pub fn check_destination(path: &Path, force: bool) -> Result<MeshFormat> {
     let format = MeshFormat::of(path)?;
-    if !folder(path).is_dir() {
-        return Err(output(
+    if !folder_of(path).is_dir() {
+        return Err(Error::output(
             path,
             "its folder does not exist",
-            format!("mkdir -p {}", folder(path).display()),
+            format!("mkdir -p {}", folder_of(path).display()),
         ));
     }
     if path.is_dir() {
-        return Err(output(path, "is a folder", "name a file"));
+        return Err(Error::output(path, "is a folder", "name a file"));
     }
     if !force && path.symlink_metadata().is_ok() {
         return Err(exists(path));
@@ -82,7 +84,7 @@ pub fn write_mesh(path: &Path, mesh: &Mesh, force: bool) -> Result<()> {
         "one colour per vertex, or none"
     );
     if format == MeshFormat::Glb && glb_bytes(mesh) > u64::from(u32::MAX) {
-        return Err(output(
+        return Err(Error::output(
             path,
             format!(
                 "{} bytes do not fit the 4 GiB of a GLB file",
@@ -91,40 +93,23 @@ pub fn write_mesh(path: &Path, mesh: &Mesh, force: bool) -> Result<()> {
             "write a .ply",
         ));
     }
-    let failed = |source: std::io::Error| {
-        let next = if source.kind() == std::io::ErrorKind::StorageFull {
-            "free some space"
-        } else {
-            "check the folder's permissions"
-        };
-        output(path, format!("cannot be written: {source}"), next)
+    let write = |file: &mut File| {
+        let mut out = BufWriter::with_capacity(1 << 20, file);
+        match format {
+            MeshFormat::Ply => ply(&mut out, mesh),
+            MeshFormat::Obj => obj(&mut out, mesh),
+            MeshFormat::Glb => glb(&mut out, mesh),
+        }?;
+        out.flush()
     };
-    let mut builder = tempfile::Builder::new();
-    builder.prefix(".neurodin-").suffix(".part");
-    #[cfg(unix)]
-    builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666)); // less the umask, as for any other file
-    let file = builder.tempfile_in(folder(path)).map_err(failed)?;
-    let mut out = BufWriter::with_capacity(1 << 20, file.as_file());
-    match format {
-        MeshFormat::Ply => ply(&mut out, mesh),
-        MeshFormat::Obj => obj(&mut out, mesh),
-        MeshFormat::Glb => glb(&mut out, mesh),
-    }
-    .and_then(|()| out.flush())
-    .and_then(|()| out.get_ref().sync_all())
-    .map_err(failed)?;
-    drop(out);
-    let renamed = if force {
-        file.persist(path)
+    let written = if force {
+        whole_file::replace(path, write)
     } else {
-        file.persist_noclobber(path)
+        whole_file::create(path, write)
     };
-    renamed.map_err(|e| {
-        if e.error.kind() == std::io::ErrorKind::AlreadyExists {
-            exists(path)
-        } else {
-            failed(e.error)
-        }
+    written.map_err(|error| match error.kind() {
+        ErrorKind::AlreadyExists => exists(path),
+        _ => Error::unwritable(path, &error),
     })?;
     tracing::info!(
         file = %path.display(),
@@ -132,28 +117,11 @@ pub fn write_mesh(path: &Path, mesh: &Mesh, force: bool) -> Result<()> {
         faces = mesh.faces.len(),
         "mesh written"
     );
-    // The name itself reaches the disk with its folder; not every system can sync one, and the file is complete either way.
-    let _ = File::open(folder(path)).and_then(|folder| folder.sync_all());
     Ok(())
 }
 
-fn folder(path: &Path) -> &Path {
-    match path.parent() {
-        Some(folder) if folder != Path::new("") => folder,
-        _ => Path::new("."),
-    }
-}
-
-fn output(path: &Path, what: impl Into<String>, next: impl Into<String>) -> Error {
-    Error::Output {
-        path: path.to_path_buf(),
-        what: what.into(),
-        next: next.into(),
-    }
-}
-
 fn exists(path: &Path) -> Error {
-    output(
+    Error::output(
         path,
         "exists already",
         "choose another name, or overwrite it with --force",
@@ -169,57 +137,36 @@ fn needs_f64(mesh: &Mesh) -> bool {
 }
 
 fn ply(out: &mut impl Write, mesh: &Mesh) -> std::io::Result<()> {
-    let wide = needs_f64(mesh);
-    let real = if wide { "double" } else { "float" };
-    write!(
-        out,
-        "ply\nformat binary_little_endian 1.0\ncomment neurodin\nelement vertex {}\n",
-        mesh.positions.len()
-    )?;
-    write!(
-        out,
-        "property {real} x\nproperty {real} y\nproperty {real} z\n"
-    )?;
+    let real = match needs_f64(mesh) {
+        true => Scalar::F64,
+        false => Scalar::F32,
+    };
+    let mut vertex = Element::new("vertex", mesh.positions.len()).with(real, &["x", "y", "z"]);
     if !mesh.normals.is_empty() {
-        write!(
-            out,
-            "property float nx\nproperty float ny\nproperty float nz\n"
-        )?;
+        vertex = vertex.with(Scalar::F32, &["nx", "ny", "nz"]);
     }
     if !mesh.colors.is_empty() {
-        write!(
-            out,
-            "property uchar red\nproperty uchar green\nproperty uchar blue\n"
-        )?;
+        vertex = vertex.with(Scalar::U8, &["red", "green", "blue"]);
     }
+    let mut elements = vec![vertex];
     if !mesh.faces.is_empty() {
-        write!(
-            out,
-            "element face {}\nproperty list uchar int vertex_indices\n",
-            mesh.faces.len()
-        )?;
+        let face = Element::new("face", mesh.faces.len());
+        elements.push(face.with_list(Scalar::U8, Scalar::I32, "vertex_indices"));
     }
-    writeln!(out, "end_header")?;
-    for (vertex, p) in mesh.positions.iter().enumerate() {
-        if wide {
-            out.write_all(bytemuck::bytes_of(&p.to_array().map(f64::to_le_bytes)))?;
-        } else {
-            out.write_all(bytemuck::bytes_of(
-                &p.as_vec3().to_array().map(f32::to_le_bytes),
-            ))?;
+    ply::write(out, "neurodin", &elements, |element, index, values| {
+        if element == "face" {
+            values.push(3.0);
+            values.extend(mesh.faces[index].map(f64::from));
+            return;
         }
-        if let Some(normal) = mesh.normals.get(vertex) {
-            out.write_all(bytemuck::bytes_of(&normal.map(f32::to_le_bytes)))?;
+        values.extend(mesh.positions[index].to_array());
+        if let Some(normal) = mesh.normals.get(index) {
+            values.extend(normal.map(f64::from));
         }
-        if let Some(color) = mesh.colors.get(vertex) {
-            out.write_all(color)?;
+        if let Some(color) = mesh.colors.get(index) {
+            values.extend(color.map(f64::from));
         }
-    }
-    for face in &mesh.faces {
-        out.write_all(&[3])?;
-        out.write_all(bytemuck::bytes_of(&face.map(u32::to_le_bytes)))?;
-    }
-    Ok(())
+    })
 }
 
 fn obj(out: &mut impl Write, mesh: &Mesh) -> std::io::Result<()> {
@@ -366,21 +313,11 @@ fn glb(out: &mut impl Write, mesh: &Mesh) -> std::io::Result<()> {
     for normal in &mesh.normals {
         out.write_all(bytemuck::bytes_of(&normal.map(f32::to_le_bytes)))?;
     }
-    let linear: [u16; 256] = std::array::from_fn(|srgb| linear_from_srgb(srgb as u8));
+    let linear: [u16; 256] =
+        std::array::from_fn(|byte| (65535.0 * srgb::decode(byte as u8)).round() as u16);
     for color in &mesh.colors {
         let [r, g, b] = color.map(|channel| linear[channel as usize].to_le_bytes());
         out.write_all(bytemuck::bytes_of(&[r, g, b, [0xff, 0xff]]))?;
     }
     Ok(())
-}
-
-/// IEC 61966-2-1, as a 16-bit fraction.
-fn linear_from_srgb(srgb: u8) -> u16 {
-    let s = f64::from(srgb) / 255.0;
-    let linear = if s <= 0.04045 {
-        s / 12.92
-    } else {
-        ((s + 0.055) / 1.055).powf(2.4)
-    };
-    (linear * 65535.0).round() as u16
 }

@@ -6,6 +6,7 @@
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, Kernel, Ptr, PtrMut, Recorder, Work};
 use crate::kernels::{self, WeightRow, weight_norm_backward, weight_norm_forward};
+use crate::random;
 
 /// Which optimiser settings a span follows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -252,15 +253,11 @@ fn upload_uniform(
     Ok(())
 }
 
-/// A uniform in [0, 1) as a function of (seed, index < 2³²): SplitMix64's finaliser on their combination (Steele et al. 2014).
+/// A uniform in [0, 1) as a function of (seed, index < 2³²).
 pub(super) fn uniform(seed: u32, index: u64) -> f64 {
-    let mut x = index
-        .wrapping_add(u64::from(seed.rotate_left(8)) << 32)
-        .wrapping_add(1)
-        .wrapping_mul(0x9e37_79b9_7f4a_7c15);
-    x = (x ^ (x >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-    x = (x ^ (x >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-    ((x ^ (x >> 31)) >> 11) as f64 / (1u64 << 53) as f64
+    let seed = u64::from(seed.rotate_left(8)) << 32;
+    let nth = index.wrapping_add(seed).wrapping_add(1);
+    random::unit(random::mix(nth.wrapping_mul(random::STEP)))
 }
 
 /// Initial values drawn one after another from a seed and a purpose.

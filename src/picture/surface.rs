@@ -11,6 +11,7 @@ use rayon::prelude::*;
 use super::Rgb;
 use crate::mesh::Mesh;
 use crate::scene::synthetic::{self, SUN};
+use crate::srgb;
 
 /// Samples per pixel and axis.
 pub const OVERSAMPLING: usize = 2;
@@ -159,7 +160,9 @@ impl Visible {
                         color[at] = if mesh.colors.is_empty() {
                             CLAY
                         } else {
-                            mix(&|v| Vec3::from(mesh.colors[v].map(decode_srgb)))
+                            mix(&|v| {
+                                Vec3::from(mesh.colors[v].map(|byte| srgb::decode(byte) as f32))
+                            })
                         };
                         // Counter-clockwise in space, y up, is clockwise on a screen whose y points down.
                         inner[at] = (b.0 - a.0).perp_dot(c.0 - a.0) > 0.0;
@@ -248,7 +251,7 @@ impl Visible {
                     }
                     let mean = sum / (OVERSAMPLING * OVERSAMPLING) as f32;
                     for (byte, value) in pixel.iter_mut().zip(mean.to_array()) {
-                        *byte = synthetic::encode_srgb(f64::from(value));
+                        *byte = srgb::encode(value);
                     }
                 }
             });
@@ -415,15 +418,6 @@ fn scan(
             }
             x += 1;
         }
-    }
-}
-
-fn decode_srgb(byte: u8) -> f32 {
-    let value = f32::from(byte) / 255.0;
-    if value <= 0.040_45 {
-        value / 12.92
-    } else {
-        ((value + 0.055) / 1.055).powf(2.4)
     }
 }
 

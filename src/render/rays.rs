@@ -1,6 +1,6 @@
 //! Pictures on the device, the random numbers of a step, and rays through pixels.
 
-use glam::{DMat4, DVec3};
+use glam::DMat4;
 
 use crate::Result;
 use crate::config::{Config, GradientKind};
@@ -134,14 +134,10 @@ fn view_row(
         }
         region_from_camera[row * 4 + 3] = center[row] as f32;
     }
-    let mut params = [0.0f32; 12];
-    for (to, from) in params.iter_mut().zip(&camera.params) {
-        *to = *from as f32;
-    }
     kernels::View {
         pixels,
         region_from_camera,
-        params,
+        params: camera.params_f32(),
         model: camera.model as u32,
         width: camera.width,
         height: camera.height,
@@ -233,9 +229,9 @@ pub struct Rays {
 impl Rays {
     /// Buffers for `n` rays in a region.
     pub fn new(gpu: &Gpu, config: &Config, region: &Region, n: u32) -> Result<Rays> {
-        let (region_shape, half): (u32, DVec3) = match region.shape {
-            RegionShape::Sphere => (0, DVec3::ONE),
-            RegionShape::Box { half } => (1, half),
+        let region_shape = match region.shape {
+            RegionShape::Sphere => 0,
+            RegionShape::Box { .. } => 1,
         };
         let n64 = u64::from(n);
         Ok(Rays {
@@ -249,7 +245,7 @@ impl Rays {
             draw: gpu.kernel(draw_rays::Shape::default())?,
             through: gpu.kernel(view_rays::Shape::default())?,
             region_shape,
-            half_extents: half.as_vec3().to_array(),
+            half_extents: region.shape.half_extents().as_vec3().to_array(),
             use_mask: u32::from(config.scene.masks.reads()),
             // The scale and shift of a monocular depth are those of its picture.
             one_view: u32::from(config.loss.mono_depth > 0.0),

@@ -3,12 +3,11 @@
 //! A background of one learned colour is enough for the former. For the latter it is not: the surface would have to explain what it
 //! cannot reach, and is lost over it.
 
-use glam::DVec3;
 use rayon::prelude::*;
 use serde::Serialize;
 
 use super::bounds::{ENOUGH_POINTS, sampled_points, train_views};
-use super::{Region, RegionShape, Scene, View, images};
+use super::{Region, Scene, View, images};
 use crate::Result;
 
 /// Whether what the pictures show beyond the region is more than an even backdrop, and what says so.
@@ -96,7 +95,7 @@ fn beside_region(scene: &Scene, region: &Region) -> Result<(Vec<[u8; 3]>, usize)
                 looked_at += 1;
                 let pixel = glam::DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5);
                 let (origin, direction) = view.ray(pixel);
-                if !meets(region, origin, direction) {
+                if !region.meets_ray(origin, direction) {
                     colours.push([r, g, b]);
                 }
             }
@@ -113,31 +112,6 @@ fn beside_region(scene: &Scene, region: &Region) -> Result<(Vec<[u8; 3]>, usize)
     Ok((beside, looked_at))
 }
 
-/// Whether the ray from `origin` along the unit vector `direction` (world frame) passes through the region.
-fn meets(region: &Region, origin: DVec3, direction: DVec3) -> bool {
-    let x = (origin - region.center) / region.radius;
-    match region.shape {
-        RegionShape::Sphere => {
-            let nearest = x + direction * (-x.dot(direction)).max(0.0);
-            nearest.length_squared() <= 1.0
-        }
-        RegionShape::Box { half } => {
-            let (mut enter, mut leave) = (0.0, f64::INFINITY);
-            for axis in 0..3 {
-                let inverse = direction[axis].recip();
-                let (a, b) = (
-                    (-half[axis] - x[axis]) * inverse,
-                    (half[axis] - x[axis]) * inverse,
-                );
-                // A ray along a side gives NaN on it, which max and min pass over.
-                enter = f64::max(enter, a.min(b));
-                leave = f64::min(leave, a.max(b));
-            }
-            enter <= leave
-        }
-    }
-}
-
 /// Channel by channel.
 fn median_colour(colours: &[[u8; 3]]) -> [u8; 3] {
     std::array::from_fn(|channel| {
@@ -145,44 +119,4 @@ fn median_colour(colours: &[[u8; 3]]) -> [u8; 3] {
         let middle = values.len() / 2;
         *values.select_nth_unstable(middle).1
     })
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn rays_meet_spheres_and_boxes() {
-        let region = |shape| Region {
-            center: DVec3::new(1.0, 0.0, 0.0),
-            radius: 2.0,
-            shape,
-            how: String::new(),
-        };
-        let ball = region(RegionShape::Sphere);
-        let slab = region(RegionShape::Box {
-            half: DVec3::new(1.0, 0.5, 0.25),
-        });
-        for (origin, direction, ball_met, slab_met) in [
-            ([5.0, 0.0, 0.0], [-1.0, 0.0, 0.0], true, true),
-            ([5.0, 0.0, 0.0], [1.0, 0.0, 0.0], false, false),
-            ([5.0, 0.0, 1.0], [-1.0, 0.0, 0.0], true, false),
-            ([5.0, 1.5, 0.0], [-1.0, 0.0, 0.0], true, false),
-            ([5.0, 2.5, 0.0], [-1.0, 0.0, 0.0], false, false),
-            ([1.5, 0.5, 0.2], [0.0, 0.0, 1.0], true, true),
-            ([1.5, 0.5, 5.0], [0.6, 0.0, -0.8], false, false),
-        ] {
-            let (origin, direction) = (DVec3::from(origin), DVec3::from(direction));
-            assert_eq!(
-                meets(&ball, origin, direction),
-                ball_met,
-                "{origin} {direction}"
-            );
-            assert_eq!(
-                meets(&slab, origin, direction),
-                slab_met,
-                "{origin} {direction}"
-            );
-        }
-    }
 }

@@ -31,6 +31,56 @@ pub enum RegionShape {
     Box { half: DVec3 },
 }
 
+impl RegionShape {
+    /// Half extents of the smallest box around it, which is about the origin.
+    pub fn half_extents(self) -> DVec3 {
+        match self {
+            RegionShape::Sphere => DVec3::ONE,
+            RegionShape::Box { half } => half,
+        }
+    }
+
+    /// Whether a point of the region frame belongs to it.
+    pub fn contains(self, x: DVec3) -> bool {
+        match self {
+            RegionShape::Sphere => x.length_squared() <= 1.0,
+            RegionShape::Box { half } => x.abs().cmple(half).all(),
+        }
+    }
+
+    /// Whether a box of the region frame has a point in common with it.
+    pub fn meets_box(self, low: DVec3, high: DVec3) -> bool {
+        match self {
+            RegionShape::Sphere => DVec3::ZERO.clamp(low, high).length_squared() <= 1.0,
+            RegionShape::Box { half } => low.cmple(half).all() && high.cmpge(-half).all(),
+        }
+    }
+
+    /// Whether the ray from `x` along the unit vector `direction` (region frame) passes through it.
+    pub fn meets_ray(self, x: DVec3, direction: DVec3) -> bool {
+        match self {
+            RegionShape::Sphere => {
+                let nearest = x + direction * (-x.dot(direction)).max(0.0);
+                nearest.length_squared() <= 1.0
+            }
+            RegionShape::Box { half } => {
+                let (mut enter, mut leave) = (0.0, f64::INFINITY);
+                for axis in 0..3 {
+                    let inverse = direction[axis].recip();
+                    let (a, b) = (
+                        (-half[axis] - x[axis]) * inverse,
+                        (half[axis] - x[axis]) * inverse,
+                    );
+                    // A ray along a side gives NaN on it, which max and min pass over.
+                    enter = f64::max(enter, a.min(b));
+                    leave = f64::min(leave, a.max(b));
+                }
+                enter <= leave
+            }
+        }
+    }
+}
+
 /// What the user says of the region. World frame and units.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RegionOverrides {
@@ -205,11 +255,13 @@ impl Region {
 
     /// Whether `point` (world frame) lies inside.
     pub fn contains(&self, point: DVec3) -> bool {
-        let x = (point - self.center) / self.radius;
-        match self.shape {
-            RegionShape::Sphere => x.length_squared() <= 1.0,
-            RegionShape::Box { half } => x.abs().cmple(half).all(),
-        }
+        self.shape.contains((point - self.center) / self.radius)
+    }
+
+    /// Whether the ray from `origin` along the unit vector `direction` (world frame) passes through it.
+    pub fn meets_ray(&self, origin: DVec3, direction: DVec3) -> bool {
+        let origin = (origin - self.center) / self.radius;
+        self.shape.meets_ray(origin, direction)
     }
 
     /// How many of the scene's views stand inside.
@@ -488,4 +540,44 @@ fn percentile_box(points: &[DVec3], low: f64, high: f64) -> (DVec3, DVec3) {
 
 fn median_point(points: &[DVec3]) -> DVec3 {
     percentile_box(points, 0.5, 0.5).0
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rays_meet_spheres_and_boxes() {
+        let region = |shape| Region {
+            center: DVec3::new(1.0, 0.0, 0.0),
+            radius: 2.0,
+            shape,
+            how: String::new(),
+        };
+        let ball = region(RegionShape::Sphere);
+        let slab = region(RegionShape::Box {
+            half: DVec3::new(1.0, 0.5, 0.25),
+        });
+        for (origin, direction, ball_met, slab_met) in [
+            ([5.0, 0.0, 0.0], [-1.0, 0.0, 0.0], true, true),
+            ([5.0, 0.0, 0.0], [1.0, 0.0, 0.0], false, false),
+            ([5.0, 0.0, 1.0], [-1.0, 0.0, 0.0], true, false),
+            ([5.0, 1.5, 0.0], [-1.0, 0.0, 0.0], true, false),
+            ([5.0, 2.5, 0.0], [-1.0, 0.0, 0.0], false, false),
+            ([1.5, 0.5, 0.2], [0.0, 0.0, 1.0], true, true),
+            ([1.5, 0.5, 5.0], [0.6, 0.0, -0.8], false, false),
+        ] {
+            let (origin, direction) = (DVec3::from(origin), DVec3::from(direction));
+            assert_eq!(
+                ball.meets_ray(origin, direction),
+                ball_met,
+                "{origin} {direction}"
+            );
+            assert_eq!(
+                slab.meets_ray(origin, direction),
+                slab_met,
+                "{origin} {direction}"
+            );
+        }
+    }
 }

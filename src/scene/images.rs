@@ -9,7 +9,7 @@ use image::metadata::Orientation;
 use image::{DynamicImage, ImageDecoder, ImageReader, RgbaImage};
 
 use super::{Camera, View};
-use crate::{Error, Result};
+use crate::{Error, Result, srgb};
 
 /// A picture in memory.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -100,7 +100,7 @@ pub(super) fn header(path: &Path) -> Result<Header> {
 fn decoder(path: &Path) -> Result<impl ImageDecoder> {
     let mut reader = ImageReader::open(path)
         .and_then(ImageReader::with_guessed_format)
-        .map_err(|source| Error::io(path, source))?;
+        .map_err(|error| Error::unreadable(path, &error))?;
     let mut limits = image::Limits::default();
     limits.max_alloc = Some(4 << 30);
     reader.limits(limits);
@@ -197,7 +197,7 @@ fn decode(path: &Path) -> Result<(RgbaImage, Orientation)> {
 
 /// Whether a JPEG lacks its end, which decoders forgive and fill with grey: no end marker follows its last scan.
 fn is_cut_off(path: &Path) -> Result<bool> {
-    let data = std::fs::read(path).map_err(|source| Error::io(path, source))?;
+    let data = std::fs::read(path).map_err(|source| Error::unreadable(path, &source))?;
     let is = |marker: u8| move |pair: &[u8]| pair == [0xff, marker];
     let last_scan = data.windows(2).rposition(is(0xda));
     Ok(data.starts_with(&[0xff, 0xd8, 0xff])
@@ -211,33 +211,16 @@ fn decode_exr(path: &Path) -> Result<RgbaImage> {
         |size: Vec2<usize>, _| RgbaImage::new(size.width() as u32, size.height() as u32),
         |image: &mut RgbaImage, at: Vec2<usize>, (r, g, b, a): (f32, f32, f32, f32)| {
             // EXR's colours are premultiplied by its alpha.
-            let straight =
-                |channel: f32| srgb_from_linear(if a > 0.0 { channel / a } else { channel });
-            let alpha = (a.clamp(0.0, 1.0) * 255.0).round() as u8;
+            let straight = |channel: f32| srgb::encode(if a > 0.0 { channel / a } else { channel });
             image.put_pixel(
                 at.x() as u32,
                 at.y() as u32,
-                image::Rgba([straight(r), straight(g), straight(b), alpha]),
+                image::Rgba([straight(r), straight(g), straight(b), srgb::byte(a)]),
             );
         },
     )
     .map_err(|error| undecodable(path, &error))?;
     Ok(image.layer_data.channel_data.pixels)
-}
-
-/// IEC 61966-2-1, to 8 bits; what is not a number is black.
-fn srgb_from_linear(linear: f32) -> u8 {
-    let linear = if linear.is_nan() {
-        0.0
-    } else {
-        linear.clamp(0.0, 1.0)
-    };
-    let encoded = if linear <= 0.003_130_8 {
-        12.92 * linear
-    } else {
-        1.055 * linear.powf(1.0 / 2.4) - 0.055
-    };
-    (encoded * 255.0).round() as u8
 }
 
 /// Where masks are not used, what they would have hidden is black.
@@ -460,21 +443,5 @@ mod tests {
         assert!(proportional((4946, 3286), (1237, 822)));
         assert!(!proportional((400, 300), (300, 400)));
         assert!(!proportional((400, 300), (400, 290)));
-    }
-
-    #[test]
-    fn srgb_has_its_published_values() {
-        let table = [
-            (0.0, 0),
-            (0.0031308, 10),
-            (0.2158605, 128),
-            (0.5, 188),
-            (1.0, 255),
-            (7.0, 255),
-            (f32::NAN, 0),
-        ];
-        for (linear, encoded) in table {
-            assert_eq!(srgb_from_linear(linear), encoded, "{linear}");
-        }
     }
 }

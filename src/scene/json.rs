@@ -22,7 +22,7 @@ pub(super) struct Document<'a> {
 
 impl<'a> Document<'a> {
     pub fn open(file: &'a Path) -> Result<Self> {
-        let data = std::fs::read(file).map_err(|source| Error::io(file, source))?;
+        let data = std::fs::read(file).map_err(|error| Error::unreadable(file, &error))?;
         let text = String::from_utf8_lossy(&data);
         let text = text.trim_start_matches('\u{feff}');
         let parsed = serde_json::from_str(text)

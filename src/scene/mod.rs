@@ -629,10 +629,7 @@ fn rigid(matrix: DMat4) -> std::result::Result<DMat4, String> {
     }
     // The nearest rotation: R ← (R + R⁻ᵀ)/2 converges quadratically to the orthogonal factor of the polar decomposition.
     let mut rotation = axes * scale.recip();
-    let skew = (rotation.transpose() * rotation - DMat3::IDENTITY)
-        .to_cols_array()
-        .into_iter()
-        .fold(0.0, |largest: f64, entry| largest.max(entry.abs()));
+    let skew = off_orthonormal(rotation);
     if skew > 0.05 {
         return Err(format!(
             "the pose is not rigid: its axes are off from orthonormal by {skew:.3}"
@@ -647,6 +644,14 @@ fn rigid(matrix: DMat4) -> std::result::Result<DMat4, String> {
         rotation.z_axis.extend(0.0),
         position.extend(1.0),
     ))
+}
+
+/// How far axes are from orthonormal: the largest entry of RᵀR − 1.
+pub(crate) fn off_orthonormal(axes: DMat3) -> f64 {
+    (axes.transpose() * axes - DMat3::IDENTITY)
+        .to_cols_array()
+        .into_iter()
+        .fold(0.0, |largest: f64, entry| largest.max(entry.abs()))
 }
 
 /// From COLMAP's and OpenCV's camera axes (y down, looking along +z) to OpenGL's, on the camera's side.

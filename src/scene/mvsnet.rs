@@ -79,7 +79,7 @@ pub(super) fn read(path: &Path, cameras: &Path) -> Result<Reading> {
 
 /// Files by the number that their names begin with. Of several with one number (a picture and its masked copy) the shortest name counts.
 fn numbered(folder: &Path, wanted: impl Fn(&str) -> bool) -> Result<BTreeMap<u64, PathBuf>> {
-    let entries = std::fs::read_dir(folder).map_err(|error| Error::io(folder, error))?;
+    let entries = std::fs::read_dir(folder).map_err(|error| Error::unreadable(folder, &error))?;
     let mut names: Vec<String> = entries
         .flatten()
         .map(|entry| entry.file_name().to_string_lossy().into_owned())
@@ -102,7 +102,7 @@ fn read_camera(file: &Path) -> Result<(DMat4, [f64; 4])> {
         let next = "take this camera and its picture out, or export it again";
         Error::input(file, what, next)
     };
-    let data = std::fs::read(file).map_err(|error| Error::io(file, error))?;
+    let data = std::fs::read(file).map_err(|error| Error::unreadable(file, &error))?;
     let text = String::from_utf8_lossy(&data);
     let words: Vec<&str> = text.split_whitespace().collect();
     let matrix = |key: &str, count: usize| -> Result<Vec<f64>> {

@@ -6,7 +6,7 @@
 
 use std::path::{Path, PathBuf};
 
-use glam::{DMat3, DMat4, DVec3};
+use glam::{DMat3, DMat4};
 
 use super::json::file_name;
 use super::{Format, Frame, FrameLens, PriorPaths, Reading, RegionHint};
@@ -107,7 +107,7 @@ fn count_cameras(file: &Path, arrays: &Arrays) -> Result<usize> {
 
 /// The pictures in a folder, sorted by name.
 fn pictures(folder: &Path) -> Result<Vec<PathBuf>> {
-    let entries = std::fs::read_dir(folder).map_err(|error| Error::io(folder, error))?;
+    let entries = std::fs::read_dir(folder).map_err(|error| Error::unreadable(folder, &error))?;
     let mut found: Vec<PathBuf> = entries
         .flatten()
         .map(|entry| entry.path())
@@ -209,12 +209,7 @@ fn unit_sphere(
     let matrix = arrays.matrix("scale_mat_0")?;
     let axes = DMat3::from_mat4(matrix);
     let radius = axes.x_axis.length();
-    let skew = axes.transpose() * axes - DMat3::from_diagonal(DVec3::splat(radius * radius));
-    let largest = skew
-        .to_cols_array()
-        .into_iter()
-        .fold(0.0, |a: f64, b| a.max(b.abs()));
-    if !(radius > 0.0 && largest <= 1e-3 * radius * radius) {
+    if !(radius > 0.0 && super::off_orthonormal(axes * radius.recip()) <= 1e-3) {
         return Err(Error::input(
             file,
             format!("scale_mat_0 makes no sphere of the unit sphere: its axes are {axes}"),

@@ -2,13 +2,14 @@
 //!
 //! Everything is there twice, as edges and as rows of points along them, since viewers that show points often ignore edges.
 
-use std::io::Write;
+use std::io::{BufWriter, Write};
 use std::path::Path;
 
 use glam::{DVec2, DVec3};
 
 use super::{Region, RegionShape, Scene, Split};
-use crate::{Error, Result};
+use crate::ply::{self, Element, Scalar};
+use crate::{Error, Result, whole_file};
 
 const TRAIN: [u8; 3] = [40, 110, 230];
 const TEST: [u8; 3] = [220, 50, 50];
@@ -135,48 +136,25 @@ fn outline(region: &Region, drawing: &mut Drawing) {
 }
 
 fn write_ply(drawing: &Drawing, path: &Path) -> Result<()> {
-    let mut data = format!(
-        "ply\nformat binary_little_endian 1.0\ncomment neurodin preview: cameras, points, region; world coordinates\n\
-         element vertex {}\nproperty double x\nproperty double y\nproperty double z\n\
-         property uchar red\nproperty uchar green\nproperty uchar blue\n\
-         element edge {}\nproperty int vertex1\nproperty int vertex2\nend_header\n",
-        drawing.vertices.len(),
-        drawing.edges.len()
-    )
-    .into_bytes();
-    for (position, color) in &drawing.vertices {
-        for coordinate in position.to_array() {
-            data.extend(coordinate.to_le_bytes());
-        }
-        data.extend(color);
-    }
-    for [from, to] in &drawing.edges {
-        data.extend((*from as i32).to_le_bytes());
-        data.extend((*to as i32).to_le_bytes());
-    }
-    let cannot = |error: &dyn std::fmt::Display| Error::Output {
-        path: path.to_path_buf(),
-        what: format!(
-            "the preview ({} bytes) cannot be written: {error}",
-            data.len()
-        ),
-        next: "choose another place with --preview".into(),
-    };
-    let folder = path
-        .parent()
-        .filter(|folder| !folder.as_os_str().is_empty())
-        .unwrap_or(Path::new("."));
-    let mut file = tempfile::NamedTempFile::new_in(folder).map_err(|error| cannot(&error))?;
-    file.write_all(&data).map_err(|error| cannot(&error))?;
-    // Temporary files are private; this one is meant to be read like any other.
-    #[cfg(unix)]
-    {
-        use std::os::unix::fs::PermissionsExt;
-        let readable = std::fs::Permissions::from_mode(0o644);
-        file.as_file()
-            .set_permissions(readable)
-            .map_err(|error| cannot(&error))?;
-    }
-    file.persist(path).map_err(|error| cannot(&error.error))?;
-    Ok(())
+    let elements = [
+        Element::new("vertex", drawing.vertices.len())
+            .with(Scalar::F64, &["x", "y", "z"])
+            .with(Scalar::U8, &["red", "green", "blue"]),
+        Element::new("edge", drawing.edges.len()).with(Scalar::I32, &["vertex1", "vertex2"]),
+    ];
+    let comment = "neurodin preview: cameras, points, region; world coordinates";
+    whole_file::replace(path, |file| {
+        let mut out = BufWriter::new(file);
+        ply::write(&mut out, comment, &elements, |element, index, values| {
+            if element == "edge" {
+                values.extend(drawing.edges[index].map(f64::from));
+                return;
+            }
+            let (position, color) = drawing.vertices[index];
+            values.extend(position.to_array());
+            values.extend(color.map(f64::from));
+        })?;
+        out.flush()
+    })
+    .map_err(|error| Error::unwritable(path, &error))
 }

@@ -7,20 +7,20 @@
 
 use std::f64::consts::PI;
 use std::fs;
-use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use glam::{DMat4, DVec2, DVec3, dvec2, dvec3};
 use rayon::prelude::*;
 use serde_json::json;
 
-use crate::{Error, Result};
+use crate::ply::{self, Element, Scalar};
+use crate::{Error, Result, srgb};
 
 mod paint;
 mod shapes;
 mod tracing;
 
-pub use tracing::{Hit, SKY, SUN, encode_srgb, normal, radiance, sdf, trace};
+pub use tracing::{Hit, SKY, SUN, normal, radiance, sdf, trace};
 
 /// Centre of the sphere that holds the scene, and its radius: what `sphere_center` and `sphere_radius` say in the dataset.
 pub const CENTER: DVec3 = dvec3(0.0, 0.0, 0.40);
@@ -150,7 +150,7 @@ impl SyntheticOptions {
                                 .map_or(SKY, |hit| tracing::radiance(&hit));
                     }
                     for (byte, value) in pixel.iter_mut().zip(linear.to_array()) {
-                        *byte = tracing::encode_srgb(value);
+                        *byte = srgb::encode(value);
                     }
                 }
             });
@@ -294,7 +294,7 @@ impl SyntheticOptions {
     /// and how much there is.
     ///
     /// # Errors
-    /// [`Error::Output`] where `root` exists and is not an empty folder; [`Error::Io`] where something cannot be written.
+    /// [`Error::Output`] where `root` exists and is not an empty folder, or something cannot be written.
     pub fn write(
         &self,
         root: &Path,
@@ -303,24 +303,21 @@ impl SyntheticOptions {
         let occupied =
             fs::read_dir(root).map_or(root.exists(), |mut entries| entries.next().is_some());
         if occupied {
-            return Err(Error::Output {
-                path: root.to_path_buf(),
-                what: "exists already".into(),
-                next: "remove it, or name another folder".into(),
-            });
+            let next = "remove it, or name another folder";
+            return Err(Error::output(root, "exists already", next));
         }
         let parent = root
             .parent()
             .filter(|p| !p.as_os_str().is_empty())
             .unwrap_or(Path::new("."));
-        fs::create_dir_all(parent).map_err(|e| Error::io(parent, e))?;
+        fs::create_dir_all(parent).map_err(|e| Error::unwritable(parent, &e))?;
         let staging = tempfile::Builder::new()
             .prefix(".dataset-")
             .tempdir_in(parent)
-            .map_err(|e| Error::io(parent, e))?;
+            .map_err(|e| Error::unwritable(parent, &e))?;
         for folder in ["images", "ground_truth"] {
             let path = staging.path().join(folder);
-            fs::create_dir(&path).map_err(|e| Error::io(path, e))?;
+            fs::create_dir(&path).map_err(|e| Error::unwritable(path, &e))?;
         }
 
         let (train, test) = (self.train(), self.test());
@@ -336,27 +333,27 @@ impl SyntheticOptions {
                 self.height,
                 image::ExtendedColorType::Rgb8,
             )
-            .map_err(|e| Error::io(path, std::io::Error::other(e)))?;
+            .map_err(|e| Error::unwritable(path, &e))?;
         }
         progress("rendering photographs", total, total);
         for (name, views) in [("transforms.json", &train), ("transforms_test.json", &test)] {
             let path = staging.path().join(name);
             let text = format!("{:#}\n", self.transforms(views));
-            fs::write(&path, text).map_err(|e| Error::io(path, e))?;
+            fs::write(&path, text).map_err(|e| Error::unwritable(path, &e))?;
         }
 
         progress("sampling the exact surface", 0, 1);
         let points = self.reference();
         let inside = Path::new("ground_truth").join("surface.ply");
         let path = staging.path().join(&inside);
-        write_points(&path, &points).map_err(|e| Error::io(path, e))?;
+        write_points(&path, &points).map_err(|e| Error::unwritable(path, &e))?;
         progress("sampling the exact surface", 1, 1);
 
         let staged = staging.keep();
         fs::rename(&staged, root).map_err(|e| {
             // What cannot be moved is of no use; the error that matters is the rename's.
             let _ = fs::remove_dir_all(&staged);
-            Error::io(root, e)
+            Error::unwritable(root, &e)
         })?;
         Ok(SyntheticDataset {
             root: root.to_path_buf(),
@@ -391,30 +388,18 @@ pub fn look(azimuth: f64, elevation: f64, distance: f64, target: DVec3) -> DMat4
 
 /// Binary PLY: position, normal, sRGB colour.
 fn write_points(path: &Path, points: &[ReferencePoint]) -> std::io::Result<()> {
+    let vertex = Element::new("vertex", points.len())
+        .with(Scalar::F32, &["x", "y", "z", "nx", "ny", "nz"])
+        .with(Scalar::U8, &["red", "green", "blue"]);
+    let comment =
+        "exact surface, seen by two or more training cameras; world frame of transforms.json";
     let mut file = std::io::BufWriter::new(fs::File::create(path)?);
-    writeln!(file, "ply\nformat binary_little_endian 1.0")?;
-    writeln!(
-        file,
-        "comment exact surface, seen by two or more training cameras; world frame of transforms.json"
-    )?;
-    writeln!(file, "element vertex {}", points.len())?;
-    for name in ["x", "y", "z", "nx", "ny", "nz"] {
-        writeln!(file, "property float {name}")?;
-    }
-    for name in ["red", "green", "blue"] {
-        writeln!(file, "property uchar {name}")?;
-    }
-    writeln!(file, "end_header")?;
-    for point in points {
-        for value in point
-            .position
-            .to_array()
-            .into_iter()
-            .chain(point.normal.to_array())
-        {
-            file.write_all(&(value as f32).to_le_bytes())?;
-        }
-        file.write_all(&point.color.to_array().map(tracing::encode_srgb))?;
-    }
+    ply::write(&mut file, comment, &[vertex], |_, index, values| {
+        let point = &points[index];
+        values.extend(point.position.to_array());
+        values.extend(point.normal.to_array());
+        let color = point.color.to_array().map(srgb::encode);
+        values.extend(color.map(f64::from));
+    })?;
     file.into_inner().map_err(|e| e.into_error())?.sync_all()
 }

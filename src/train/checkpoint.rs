@@ -9,7 +9,7 @@
 
 use crate::config::Config;
 use crate::scene::Region;
-use crate::{Error, Result};
+use crate::{Error, Result, whole_file};
 use safetensors::Dtype;
 use std::collections::BTreeMap;
 use std::fs::{self, File};
@@ -82,7 +82,6 @@ pub fn save(
     read: &mut Source,
 ) -> Result<PathBuf> {
     let path = path_of(folder, state.step);
-    let part = path.with_extension("safetensors.part");
     let header = header(state, tensors);
     let total = 8
         + header.len() as u64
@@ -107,27 +106,19 @@ pub fn save(
     };
 
     fs::create_dir_all(folder).map_err(|error| failed(0, error))?;
-    remove_leftovers(folder, &part);
-    let written = (|| {
+    remove_leftovers(folder, &whole_file::part_of(&path));
+    let mut done = 0;
+    let written = whole_file::replace(&path, |file| {
         let mut file = Counted {
-            inner: File::create(&part).map_err(|error| failed(0, error))?,
-            done: 0,
+            inner: file,
+            done: &mut done,
         };
-        write(&mut file, &header, tensors, read).map_err(|error| match error {
-            Failure::Write(error) => failed(file.done, error),
-            Failure::Read(error) => error,
-        })?;
-        file.inner
-            .sync_all()
-            .map_err(|error| failed(file.done, error))?;
-        fs::rename(&part, &path).map_err(|error| failed(total, error))
-    })();
-    if written.is_err() {
-        // What was wrong is said already; a leftover that cannot be removed changes nothing.
-        let _ = fs::remove_file(&part);
-    }
-    written?;
-    sync_folder(folder).map_err(|error| failed(total, error))?;
+        write(&mut file, &header, tensors, read)
+    });
+    written.map_err(|error| match error {
+        Failure::Write(error) => failed(done, error),
+        Failure::Read(error) => error,
+    })?;
     tracing::info!(
         file = %path.display(),
         step = state.step,
@@ -147,16 +138,18 @@ fn path_of(folder: &Path, step: u64) -> PathBuf {
 /// The checkpoints of a folder by step, oldest first, damaged ones included.
 ///
 /// # Errors
-/// [`Error::Io`] if the folder cannot be listed; a folder that does not exist holds none.
+/// [`Error::Input`] if the folder cannot be listed; a folder that does not exist holds none.
 pub fn files(folder: &Path) -> Result<Vec<(u64, PathBuf)>> {
     let entries = match fs::read_dir(folder) {
         Ok(entries) => entries,
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
-        Err(error) => return Err(Error::io(folder, error)),
+        Err(error) => return Err(Error::unreadable(folder, &error)),
     };
     let mut found = Vec::new();
     for entry in entries {
-        let path = entry.map_err(|error| Error::io(folder, error))?.path();
+        let path = entry
+            .map_err(|error| Error::unreadable(folder, &error))?
+            .path();
         let name = path
             .file_name()
             .and_then(|name| name.to_str())
@@ -195,30 +188,21 @@ fn prune(folder: &Path, step: u64, keep: u32) -> Result<()> {
             kept += 1;
             continue;
         }
-        fs::remove_file(&path).map_err(|error| Error::io(&path, error))?;
+        fs::remove_file(&path).map_err(|error| Error::unwritable(&path, &error))?;
     }
     Ok(())
 }
 
-/// Makes a rename in this folder outlast a power failure.
-fn sync_folder(folder: &Path) -> io::Result<()> {
-    // Windows neither needs nor allows it.
-    if cfg!(unix) {
-        File::open(folder)?.sync_all()?;
-    }
-    Ok(())
+/// A file that tells how much was written.
+struct Counted<'a> {
+    inner: &'a mut File,
+    done: &'a mut u64,
 }
 
-/// A file that knows how much was written.
-struct Counted<W> {
-    inner: W,
-    done: u64,
-}
-
-impl<W: Write> Write for Counted<W> {
+impl Write for Counted<'_> {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         let count = self.inner.write(bytes)?;
-        self.done += count as u64;
+        *self.done += count as u64;
         Ok(count)
     }
 
@@ -230,6 +214,12 @@ impl<W: Write> Write for Counted<W> {
 enum Failure {
     Write(io::Error),
     Read(Error),
+}
+
+impl From<io::Error> for Failure {
+    fn from(error: io::Error) -> Failure {
+        Failure::Write(error)
+    }
 }
 
 /// Length and JSON header, padded to eight bytes. The same state gives the same bytes.
@@ -282,7 +272,7 @@ fn write(
     tensors: &[Tensor],
     read: &mut Source,
 ) -> Result<(), Failure> {
-    file.write_all(header).map_err(Failure::Write)?;
+    file.write_all(header)?;
     let mut checksums = vec![crc32fast::hash(header)];
     for tensor in tensors {
         let mut checksum = crc32fast::Hasher::new();
@@ -296,13 +286,13 @@ fn write(
             );
             let bytes: &[u8] = bytemuck::cast_slice(&numbers);
             checksum.update(bytes);
-            file.write_all(bytes).map_err(Failure::Write)?;
+            file.write_all(bytes)?;
         }
         checksums.push(checksum.finalize());
     }
     checksums.push(crc32fast::hash(bytemuck::cast_slice(&checksums)));
-    file.write_all(bytemuck::cast_slice(&checksums))
-        .map_err(Failure::Write)
+    file.write_all(bytemuck::cast_slice(&checksums))?;
+    Ok(())
 }
 
 /// 0..len in consecutive ranges.

@@ -82,7 +82,8 @@ impl Trainer {
         if config.deterministic != gpu.deterministic() {
             return Err(Error::Config {
                 what: format!(
-                    "deterministic = {}, but the device was opened with GpuOptions::deterministic = {}",
+                    "deterministic = {}, but the device was opened with GpuOptions::deterministic = {}\n  \
+                     next: open it with GpuOptions {{ deterministic: config.deterministic, .. }}",
                     config.deterministic,
                     gpu.deterministic()
                 ),
@@ -91,9 +92,10 @@ impl Trainer {
         if config.matrices != gpu.options().matrices {
             return Err(Error::Config {
                 what: format!(
-                    "matrices = {:?}, but the device was opened with GpuOptions::matrices = {:?}",
-                    config.matrices,
-                    gpu.options().matrices
+                    "matrices = {}, but the device was opened with those of matrices = {}\n  \
+                     next: open it with GpuOptions {{ matrices: config.matrices, .. }}",
+                    serde_json::json!(config.matrices),
+                    serde_json::json!(gpu.options().matrices)
                 ),
             });
         }

@@ -5,6 +5,7 @@ use crate::config::Config;
 use crate::eval::psnr;
 use crate::render::Rendered;
 use crate::scene::{Camera, Picture, Scene, Split};
+use crate::srgb;
 use crate::{Error, Result};
 use glam::DMat4;
 use image::imageops::{self, FilterType};
@@ -91,13 +92,8 @@ fn side_by_side(rendered: &Rendered, photo: &Picture) -> RgbImage {
         let at = (y * width + x % width) as usize;
         image::Rgb(match x / width {
             0 => [0, 1, 2].map(|c| photo.rgba[4 * at + c]),
-            1 => rendered.rgb[at].map(byte),
-            _ => rendered.normal[at].map(|n| byte(0.5 + 0.5 * n)),
+            1 => rendered.rgb[at].map(srgb::byte),
+            _ => rendered.normal[at].map(|n| srgb::byte(0.5 + 0.5 * n)),
         })
     })
-}
-
-/// 8-bit value of a number in [0, 1].
-fn byte(value: f32) -> u8 {
-    (value.clamp(0.0, 1.0) * 255.0).round() as u8
 }

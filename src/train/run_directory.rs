@@ -2,7 +2,7 @@
 
 use crate::config::Config;
 use crate::scene::{Format, Region, Scene, SceneOptions, Split};
-use crate::{Error, Result};
+use crate::{Error, Result, whole_file};
 use serde::{Deserialize, Serialize};
 use std::fs::{self, File};
 use std::io::{ErrorKind, Write};
@@ -146,19 +146,8 @@ impl RunDirectory {
     /// # Errors
     /// [`Error::Output`] if it cannot be written.
     pub fn write(&self, path: &Path, text: &str) -> Result<()> {
-        let part = path.with_extension("part");
-        let written = File::create(&part).and_then(|mut file| {
-            file.write_all(text.as_bytes())?;
-            file.sync_all()?;
-            fs::rename(&part, path)
-        });
-        written.map_err(|error| {
-            Error::output(
-                path,
-                format!("cannot be written: {error}"),
-                "make room or mend the permissions there",
-            )
-        })
+        whole_file::replace(path, |file| file.write_all(text.as_bytes()))
+            .map_err(|error| Error::unwritable(path, &error))
     }
 }
 
@@ -197,13 +186,7 @@ const LOCK: &str = ".lock";
 /// Takes the folder for this process. File systems without locks go without.
 fn lock(root: &Path) -> Result<Option<File>> {
     let path = root.join(LOCK);
-    let file = File::create(&path).map_err(|error| {
-        Error::output(
-            root,
-            format!("cannot write there: {error}"),
-            "mend the permissions",
-        )
-    })?;
+    let file = File::create(&path).map_err(|error| Error::unwritable(root, &error))?;
     match file.try_lock() {
         Ok(()) => Ok(Some(file)),
         Err(fs::TryLockError::WouldBlock) => Err(Error::output(
@@ -250,11 +233,12 @@ impl SceneRecord {
     /// What `scene`, opened from `dataset`, is to a run.
     ///
     /// # Errors
-    /// [`Error::Io`] if the dataset's path cannot be resolved.
+    /// [`Error::Input`] if the dataset's path cannot be resolved.
     pub fn new(dataset: &Path, scene: &Scene, region: &Region) -> Result<SceneRecord> {
         let rows = region.world_from_region().transpose().to_cols_array_2d();
         Ok(SceneRecord {
-            dataset: fs::canonicalize(dataset).map_err(|error| Error::io(dataset, error))?,
+            dataset: fs::canonicalize(dataset)
+                .map_err(|error| Error::unreadable(dataset, &error))?,
             format: scene.format,
             region: region.clone(),
             world_from_region: rows,

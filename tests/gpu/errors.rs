@@ -113,6 +113,28 @@ fn an_unknown_device_is_refused_with_the_list() -> Result<()> {
 }
 
 #[test]
+fn what_was_left_out_on_request_is_not_blamed_on_the_device() -> Result<()> {
+    let deterministic = |portable| {
+        Gpu::new(&GpuOptions {
+            deterministic: true,
+            portable,
+            ..GpuOptions::default()
+        })
+    };
+    let device_lacks_it = deterministic(false).is_err();
+    let error = deterministic(true).expect_err("portable leaves 64-bit integers out");
+    assert!(matches!(error, Error::NoDevice { .. }));
+    let text = error.to_string();
+    assert_eq!(
+        text.contains("GpuOptions::portable"),
+        !device_lacks_it,
+        "{text}"
+    );
+    assert!(text.contains("next: "), "{text}");
+    Ok(())
+}
+
+#[test]
 fn a_failed_recording_says_so_and_the_device_works_on() -> Result<()> {
     let gpu = Gpu::new(&watched())?;
     let words = gpu.buffer::<u32>("words", 16)?;

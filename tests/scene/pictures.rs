@@ -172,6 +172,26 @@ fn masks_of_another_size_are_refused() {
     assert!(Scene::open(dataset.path(), &options).is_ok());
 }
 
+/// A file that is there but fails to be read, played by the process's memory, of which the first page is never there.
+#[test]
+#[cfg(target_os = "linux")]
+fn files_that_cannot_be_read_are_unusable_input() {
+    let fails_to_read = |dataset: &Dataset, file: &str| {
+        fs::remove_file(dataset.at(file)).unwrap();
+        std::os::unix::fs::symlink("/proc/self/mem", dataset.at(file)).unwrap();
+        let first = dataset.open().and_then(|scene| scene.load_picture(0));
+        refused(first, &[file, "cannot be read: ", "next: "]);
+    };
+    let rig = Rig::skewed(3);
+    let transforms = || rig.dataset(&rig.transforms(json!({})));
+    fails_to_read(&transforms(), "images/view_000.png");
+    fails_to_read(&transforms(), "transforms.json");
+    let text = Dataset::new();
+    rig.write_pictures(&text.at("images"));
+    rig.write_colmap_text(&text.at("sparse/0"));
+    fails_to_read(&text, "sparse/0/images.txt");
+}
+
 #[test]
 fn reduced_pictures_see_the_same_rays() {
     let rig = Rig::skewed(2);

@@ -12,6 +12,7 @@ use crate::picture::chart::{Chart, Series, grouped, short};
 use crate::picture::surface::{Eye, Lens, Visible, clay, colors, sun_eye};
 use crate::picture::{Rgb, depth_picture, normal_picture};
 use crate::scene::synthetic::{CENTER, RADIUS, look};
+use crate::srgb;
 
 /// Sides from which the mesh is shown: azimuth and elevation in degrees.
 const SIDES: [[f64; 2]; 4] = [[24.0, 28.0], [114.0, 28.0], [204.0, 28.0], [294.0, 28.0]];
@@ -276,7 +277,7 @@ fn view(seen: &Seen) -> report::View {
                 .rgb
                 .iter()
                 .flatten()
-                .map(|c| (255.0 * c.clamp(0.0, 1.0)).round() as u8)
+                .map(|c| srgb::byte(*c))
                 .collect(),
         },
         depth: depth_picture(width, height, &depth, near, far.max(near + 1e-6)),

@@ -137,12 +137,7 @@ fn read_similarity(file: &Path) -> Result<DMat4> {
     }
     let axes = DMat3::from_mat4(matrix);
     let scale = axes.determinant().abs().cbrt();
-    let skew = axes.transpose() * axes - DMat3::from_diagonal(DVec3::splat(scale * scale));
-    let largest = skew
-        .to_cols_array()
-        .into_iter()
-        .fold(0.0, |a: f64, b| a.max(b.abs()));
-    if !(scale > 0.0 && largest <= 1e-3 * scale * scale) {
+    if !(scale > 0.0 && scene::off_orthonormal(axes * scale.recip()) <= 1e-3) {
         return Err(wrong(format!("is no similarity: its axes are {axes}")));
     }
     Ok(matrix)

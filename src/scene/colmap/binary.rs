@@ -21,7 +21,7 @@ struct Bytes<'a> {
 
 impl<'a> Bytes<'a> {
     fn open(file: &'a Path) -> Result<Self> {
-        let data = std::fs::read(file).map_err(|source| Error::io(file, source))?;
+        let data = std::fs::read(file).map_err(|error| Error::unreadable(file, &error))?;
         Ok(Bytes { file, data, at: 0 })
     }
 

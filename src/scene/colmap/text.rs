@@ -24,7 +24,7 @@ struct Words<'a> {
 
 impl<'a> Lines<'a> {
     fn open(file: &'a Path) -> Result<Self> {
-        let data = std::fs::read(file).map_err(|source| Error::io(file, source))?;
+        let data = std::fs::read(file).map_err(|error| Error::unreadable(file, &error))?;
         let text = String::from_utf8_lossy(&data).into_owned();
         Ok(Lines { file, text })
     }

@@ -173,14 +173,3 @@ fn cross(part: &Part, origin: DVec3, direction: DVec3, margin: f64) -> Option<(f
     let leave = a.max(b).min_element();
     (enter < leave && leave > 0.0).then_some((enter, leave))
 }
-
-/// Linear to sRGB (IEC 61966-2-1), one byte.
-pub fn encode_srgb(linear: f64) -> u8 {
-    let value = linear.clamp(0.0, 1.0);
-    let encoded = if value <= 0.003_130_8 {
-        12.92 * value
-    } else {
-        1.055 * value.powf(1.0 / 2.4) - 0.055
-    };
-    (255.0 * encoded).round() as u8
-}

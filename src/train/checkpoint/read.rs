@@ -54,7 +54,7 @@ impl Refusal {
                 why,
                 "use the version of neurodin that wrote it, or begin a new run",
             ),
-            Refusal::Io(error) => Error::io(path, error),
+            Refusal::Io(error) => Error::unreadable(path, &error),
         }
     }
 }
@@ -129,7 +129,7 @@ impl Checkpoint {
     /// Passes a tensor's elements to `take`, in consecutive ranges of at most [`PIECE`] that begin at the index given.
     ///
     /// # Errors
-    /// [`Error::Input`] if there is no tensor of that name and shape; [`Error::Io`]; what `take` returns.
+    /// [`Error::Input`] if there is no tensor of that name and shape, or the file cannot be read; what `take` returns.
     pub fn read(
         &self,
         tensor: &Tensor,
@@ -153,7 +153,7 @@ impl Checkpoint {
                 tensor.name, self.tensors[index].shape, tensor.shape
             )));
         }
-        let failed = |error| Error::io(&self.path, error);
+        let failed = |error| Error::unreadable(&self.path, &error);
         let mut file = File::open(&self.path).map_err(failed)?;
         file.seek(SeekFrom::Start(self.firsts[index]))
             .map_err(failed)?;
