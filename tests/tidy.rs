@@ -1,5 +1,6 @@
 //! The rules of the repository that a compiler does not check.
 
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::{Path, PathBuf};
 
@@ -207,6 +208,72 @@ fn nothing_is_kept_equal_by_comment() {
             .any(|phrase| line.contains(phrase))
     });
     none("what has to be equal is declared once", offences);
+}
+
+/// The rooms that a file names by `crate::room` or `crate::{room::.., ..}`, comments and its own tests left out.
+fn imports(text: &str) -> BTreeSet<String> {
+    let code = text.split("#[cfg(test)]\nmod tests").next().unwrap_or("");
+    let code: Vec<&str> = code
+        .lines()
+        .filter(|line| !line.trim_start().starts_with("//"))
+        .collect();
+    let code = code.join("\n");
+    let mut found = BTreeSet::new();
+    for (at, _) in code.match_indices("crate::") {
+        let rest = &code[at + "crate::".len()..];
+        let (mut depth, mut name) = (0, String::new());
+        for character in rest.chars() {
+            match character {
+                '{' => depth += 1,
+                '}' => depth -= 1,
+                _ if depth <= 1 && (character.is_alphanumeric() || character == '_') => {
+                    name.push(character);
+                    continue;
+                }
+                ':' if depth == 1 && name.is_empty() => continue,
+                _ => {}
+            }
+            if depth <= 1 && !name.is_empty() {
+                found.insert(std::mem::take(&mut name));
+            }
+            if depth == 0 {
+                break;
+            }
+        }
+    }
+    found
+}
+
+#[test]
+fn rooms_import_what_the_architecture_says() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let page = fs::read_to_string(root.join("ARCHITECTURE.md")).unwrap();
+    let arrows = page.lines().filter_map(|line| line.split_once(" → "));
+    let said: BTreeMap<String, BTreeSet<String>> = arrows
+        .filter(|(room, _)| root.join("src").join(room.trim()).is_dir())
+        .map(|(room, others)| {
+            let others = others.split(", ").filter(|other| *other != "nothing");
+            (room.trim().into(), others.map(str::to_owned).collect())
+        })
+        .collect();
+    assert!(said.len() > 5, "{said:?}");
+    let mut there: BTreeMap<String, BTreeSet<String>> = BTreeMap::new();
+    for (path, text) in sources() {
+        let Ok(inside) = path.strip_prefix("src") else {
+            continue;
+        };
+        let room = inside.components().next().unwrap().as_os_str();
+        let room = room.to_string_lossy().replace(".rs", "");
+        if !said.contains_key(&room) {
+            assert!(!root.join("src").join(&room).is_dir(), "no arrow of {room}");
+            continue;
+        }
+        let others = imports(&text)
+            .into_iter()
+            .filter(|other| *other != room && said.contains_key(other));
+        there.entry(room.clone()).or_default().extend(others);
+    }
+    assert_eq!(said, there);
 }
 
 #[test]
