@@ -69,8 +69,8 @@ pub struct EvalArgs {
     #[arg(long, value_name = "D", requires = "visible_from")]
     pub hidden_by: Option<f64>,
     /// Points drawn on a mesh (--protocol plain) [default: 500000]
-    #[arg(long, value_name = "N")]
-    pub samples: Option<usize>,
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=50_000_000))]
+    pub samples: Option<u32>,
     /// Seed of the points
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub seed: u64,
@@ -130,7 +130,7 @@ fn plain(
     })?;
     let size = 0.5 * (high - low).length();
     let options = GeometryOptions {
-        samples: args.samples.unwrap_or(500_000),
+        samples: args.samples.unwrap_or(500_000) as usize,
         seed: args.seed,
         thresholds: match args.thresholds[..] {
             [] => [0.005, 0.01, 0.02].map(|share| share * size).to_vec(),

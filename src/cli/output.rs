@@ -76,6 +76,11 @@ impl Context {
         }
     }
 
+    /// Whether results are for programs (`--json`).
+    pub fn prints_json(&self) -> bool {
+        self.json
+    }
+
     /// Text on stdout. A reader that has gone away is no error.
     ///
     /// # Errors

@@ -49,7 +49,7 @@ pub(super) struct TrainArgs {
     /// Prepare everything, say what would be done, and write nothing
     #[arg(long)]
     pub dry_run: bool,
-    /// Print every setting as TOML on stdout, and do nothing else
+    /// Print every setting as TOML on stdout, with a dataset those that suit it, and do nothing else
     #[arg(long)]
     pub print_config: bool,
     #[command(flatten)]
@@ -61,10 +61,17 @@ pub(super) struct TrainArgs {
 pub(super) fn run(args: &TrainArgs, context: &Context) -> anyhow::Result<()> {
     let out = args.out.as_deref().unwrap_or(Path::new(""));
     let task = match (args.resume, args.print_config) {
-        (true, true) => return Ok(context.print(&resumed(args, out)?.config.to_toml())?),
+        (true, true) => return print_config(&resumed(args, out)?.config, context),
         (true, false) => resume(args, out, context)?,
         (false, true) => {
-            return Ok(context.print(&described(&args.settings, &args.scene)?.to_toml())?);
+            let config = match &args.dataset {
+                Some(dataset) => {
+                    let scene = open_scene(&args.settings, &args.scene, dataset)?;
+                    Chosen::of(&args.settings, &args.scene, &scene)?.config
+                }
+                None => described(&args.settings, &args.scene)?,
+            };
+            return print_config(&config, context);
         }
         (false, false) => begin(args, out, context)?,
     };
@@ -74,6 +81,14 @@ pub(super) fn run(args: &TrainArgs, context: &Context) -> anyhow::Result<()> {
     }
     let done = task.run(args.force, context)?;
     Ok(context.result(&done.to_json(), &done.text())?)
+}
+
+/// Every setting on stdout: as TOML, or under `--json` as the object that it is.
+fn print_config(config: &Config, context: &Context) -> anyhow::Result<()> {
+    Ok(match context.prints_json() {
+        true => context.result(&json!(config), "")?,
+        false => context.print(&config.to_toml())?,
+    })
 }
 
 /// Trains on a dataset into `out`, or where a run of it is there already goes on with that.

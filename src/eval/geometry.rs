@@ -137,11 +137,17 @@ pub fn score_geometry<V: Viewpoint>(
 ) -> Result<GeometryScores> {
     let config = |what: &str| Error::Config { what: what.into() };
     let is_distance = |d: &f64| d.is_finite() && *d > 0.0;
-    if options.samples == 0
-        || !is_distance(&options.trim)
-        || !options.thresholds.iter().all(is_distance)
-    {
-        return Err(config("samples, trim and thresholds must be positive"));
+    if options.samples == 0 {
+        return Err(config(
+            "no samples are to be drawn; next: a positive number of them",
+        ));
+    }
+    let mut distances = options.thresholds.iter().chain([&options.trim]);
+    if let Some(wrong) = distances.find(|d| !is_distance(d)) {
+        return Err(config(&format!(
+            "{wrong} is no distance to compare with; next: positive thresholds and trim, and a reference that has an extent where they \
+             follow from it"
+        )));
     }
     let (samples, scored) = surface_samples(mesh, views, options);
     let ours = Target::over(mesh, &scored, &samples);

@@ -636,8 +636,29 @@ fn presets_are_suggested_and_contradicted() {
     assert_eq!(config["preset"], "outdoor-tiny");
     assert_eq!(config["background"]["kind"], "field");
     assert!(
-        stderr.contains("look inwards") && !stderr.contains("warning"),
+        stderr.contains("look inwards") && stderr.contains("only 6 training views"),
         "{stderr}"
+    );
+    assert_eq!(stderr.matches("warning").count(), 1, "{stderr}");
+    let printed = |more: &[&str]| {
+        let words = [&["train", &photos, "--print-config"], &SMALL[..], more].concat();
+        let said = run(&words);
+        assert_eq!(said.code, Some(0), "{}", said.stderr);
+        said.stdout
+    };
+    let table: toml::Table = printed(&[]).parse().unwrap();
+    assert_eq!(table["background"]["kind"].as_str(), Some("field"));
+    let object: Value = serde_json::from_str(&printed(&["--json"])).unwrap();
+    assert_eq!(object, config, "what a dry run would take");
+    // The region that is shown is the one that is trained.
+    let region = |said: &str| {
+        let number = said.split("radius ").nth(1).unwrap();
+        let number = number.split([',', ' ']).next().unwrap();
+        number.parse::<f64>().unwrap()
+    };
+    assert!(
+        (region(&text) - region(&stderr)).abs() < 1e-3,
+        "{text}{stderr}"
     );
     let (config, stderr) = dry(&["--preset", "indoor-tiny"]);
     assert_eq!(config["preset"], "indoor-tiny");
