@@ -227,6 +227,18 @@ mod tests {
         }
     }
 
+    /// By equal factors in equal times; the published range stays what it is.
+    #[test]
+    fn the_range_of_taps_shrinks() {
+        let published = Schedule::new(&Config::default());
+        let shrinking = Config::default().with_assignment("surface.tap_range_end=0.001");
+        let shrinking = Schedule::new(&shrinking.unwrap());
+        for (step, range) in [(0, 0.1), (150_000, 0.01), (300_000, 0.001)] {
+            assert_eq!(published.at(step).tap_range, 0.1);
+            assert!((shrinking.at(step).tap_range / range - 1.0).abs() < 1e-12);
+        }
+    }
+
     #[test]
     fn a_weight_of_nothing_has_no_ramp() {
         let ramped = Config::preset("indoor-large").unwrap();

@@ -378,6 +378,12 @@ fn outputs_that_exist_exit_8_untouched() {
     );
     fs::write(occupied.join("config.toml"), "").unwrap();
     fails(
+        &["train", &photos, "--out", out, "--force"],
+        8,
+        &["config.toml", "no run that it could belong to"],
+    );
+    fs::write(occupied.join("scene.json"), "{}").unwrap();
+    fails(
         &["train", &photos, "--out", out],
         8,
         &["holds a run", "--resume", "--force"],
