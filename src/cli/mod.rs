@@ -19,6 +19,7 @@ mod progress;
 mod render;
 mod scene_args;
 mod settings;
+mod study;
 mod suggestion;
 mod timing;
 mod train;
