@@ -2,11 +2,11 @@
 
 mod between;
 
-use super::Context;
 use super::interrupt::{self, stop_if};
 use super::progress::Progress;
 use super::scene_args::SceneArgs;
 use super::timing::{STOPPED, Timed, Until, time};
+use super::{Context, destination};
 use crate::config::Config;
 use crate::gpu::{DeviceKind, GpuOptions, Roofs, TableRoofs};
 use crate::scene::synthetic::SyntheticOptions;
@@ -53,21 +53,53 @@ pub(super) struct BenchArgs {
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     pub rays: Option<u32>,
     /// Time for the steps of each preset, stage and size
-    #[arg(long, value_name = "S", default_value_t = 10.0)]
+    #[arg(long, value_name = "S", default_value_t = 10.0, value_parser = seconds)]
     pub seconds: f64,
     /// Write the result as JSON to this file, too
     #[arg(short, long, value_name = "FILE")]
     pub out: Option<PathBuf>,
+    /// Replace that file if it exists
+    #[arg(long)]
+    pub force: bool,
     /// Compare two results instead of measuring
     #[arg(long, num_args = 2, value_names = ["BEFORE", "AFTER"])]
     pub between: Option<Vec<PathBuf>>,
 }
 
+/// A time for which steps can be measured.
+fn seconds(text: &str) -> Result<f64, String> {
+    let seconds = text.parse().map_err(|_| "is not a number".to_string())?;
+    match seconds > 0.0 && seconds <= 86_400.0 {
+        true => Ok(seconds),
+        false => Err("is not in (0, 86400]".into()),
+    }
+}
+
 impl BenchArgs {
-    /// Sizes of dictionaries that are measured, as powers of two.
-    fn dictionaries(&self) -> Vec<u32> {
-        let sizes = self.sizes.iter().copied();
-        sizes.filter(|&size| size > 0).collect()
+    /// The presets that are measured.
+    ///
+    /// # Errors
+    /// [`Error::Config`] for unknown ones, and for a number of rays that none can have.
+    fn presets(&self, rays: Option<u32>) -> Result<Vec<Config>> {
+        let presets = self.presets.iter();
+        presets
+            .map(|name| with_rays(Config::preset(name)?, rays).validated())
+            .collect()
+    }
+
+    /// outdoor-large with every size of its dictionary that is measured.
+    ///
+    /// # Errors
+    /// [`Error::Config`] for a size that no dictionary can have.
+    fn dictionaries(&self, rays: Option<u32>) -> Result<Vec<Config>> {
+        let sizes = self.sizes.iter().filter(|size| **size > 0);
+        sizes
+            .map(|size| {
+                let mut config = with_rays(Config::preset("outdoor-large")?, rays);
+                config.hash.log2_size = *size;
+                config.validated()
+            })
+            .collect()
     }
 }
 
@@ -76,10 +108,12 @@ pub(super) fn run(args: &BenchArgs, context: &Context) -> anyhow::Result<()> {
         let (result, text) = between::compare(&files[0], &files[1])?;
         return Ok(context.result(&result, &text)?);
     }
-    for name in &args.presets {
-        Config::preset(name)?;
+    // Whatever cannot be is said before anything is measured. Both stages of each preset, and a dictionary's first.
+    let measurements = 2 * args.presets(args.rays)?.len() + args.dictionaries(args.rays)?.len();
+    if let Some(path) = &args.out {
+        destination::check(path, args.force)?;
     }
-    let bench = Bench::new(args, context)?;
+    let bench = Bench::new(args.seconds, measurements, context)?;
     let gpu = context.gpu()?;
     context.say(&format!("device   {}", gpu.info().name));
     let roofs = gpu.measure_roofs()?;
@@ -99,24 +133,65 @@ pub(super) fn run(args: &BenchArgs, context: &Context) -> anyhow::Result<()> {
         _ => None,
     });
     let mut presets = Vec::new();
-    for name in &args.presets {
-        presets.extend(bench.preset(name, rays, &roofs)?);
-    }
-    let dictionary = bench.dictionary(&args.dictionaries(), rays, &roofs)?;
-    let result = json!({
+    let mut dictionary = Vec::new();
+    // Minutes that were measured are worth having, though not all were.
+    let stopped = match bench
+        .presets(&args.presets(rays)?, &roofs, &mut presets)
+        .and_then(|()| bench.dictionary(&args.dictionaries(rays)?, &roofs, &mut dictionary))
+    {
+        Err(stopped @ Error::Interrupted { .. }) => Some(stopped),
+        outcome => {
+            outcome?;
+            None
+        }
+    };
+    drop(bench);
+    let mut result = json!({
         "version": super::VERSION.as_str(),
         "device": gpu.info().name,
         "driver": gpu.info().driver,
+        "incomplete": stopped.is_some(),
         "roofs": { "gb_per_s": roofs.copy_gb_s, "gflop_per_s": roofs.fma_gflop_s },
         "tables": tables.iter().map(table_json).collect::<Vec<_>>(),
         "presets": presets,
-        "dictionary": dictionary,
     });
-    if let Some(path) = &args.out {
-        std::fs::write(path, format!("{result:#}\n"))
-            .map_err(|error| Error::unwritable(path, &error))?;
+    if !dictionary.is_empty() {
+        context.say(&with_ratios(&mut dictionary));
     }
-    Ok(context.result(&result, "")?)
+    result["dictionary"] = dictionary.into();
+    context.result(&result, "")?;
+    // What was measured has been said by now, whatever becomes of the file.
+    if let Some(path) = &args.out {
+        destination::write(path, args.force, |file| writeln!(file, "{result:#}"))?;
+    }
+    stopped.map_or(Ok(()), |stopped| Err(stopped.into()))
+}
+
+/// The rows of the dictionary as a table, and in each its ratio to the one at 2^19.
+fn with_ratios(rows: &mut [Value]) -> String {
+    let of = |row: &Value, key: &str| row[key].as_f64().unwrap_or(f64::NAN);
+    let base = rows.iter().find(|row| row["log2_size"] == 19);
+    let base = base.map(|row| [of(row, "cpu_ms_per_step"), of(row, "device_ms_per_step")]);
+    let mut text =
+        String::from("\nstage 1 by dictionary   CPU ms    ratio   device ms    ratio        MiB\n");
+    for row in rows {
+        let times = [of(row, "cpu_ms_per_step"), of(row, "device_ms_per_step")];
+        let ratios = base.map(|base| [times[0] / base[0], times[1] / base[1]]);
+        let shown = |ratio: Option<f64>| ratio.map_or("-".into(), |r| format!("{r:.3}"));
+        let _ = writeln!(
+            text,
+            "2^{:<20} {:>8.1} {:>8} {:>11.1} {:>8} {:>10.0}",
+            row["log2_size"],
+            times[0],
+            shown(ratios.map(|r| r[0])),
+            times[1],
+            shown(ratios.map(|r| r[1])),
+            of(row, "device_bytes") / f64::from(1 << 20)
+        );
+        row["ratio_of_cpu_ms"] = ratios.map(|r| r[0]).into();
+        row["ratio_of_device_ms"] = ratios.map(|r| r[1]).into();
+    }
+    text
 }
 
 fn table_json(table: &TableRoofs) -> Value {
@@ -149,15 +224,13 @@ impl Drop for Bench<'_> {
 const WARMUP: u64 = 3;
 
 impl<'c> Bench<'c> {
-    fn new(args: &BenchArgs, context: &'c Context) -> anyhow::Result<Bench<'c>> {
+    fn new(seconds: f64, measurements: usize, context: &'c Context) -> anyhow::Result<Bench<'c>> {
         let folder = std::env::temp_dir().join(format!("neurodin-bench-{}", std::process::id()));
-        // Both stages of each preset, and a dictionary's first.
-        let measurements = 2 * args.presets.len() + args.dictionaries().len();
-        let total = (args.seconds * measurements as f64).ceil() as u64;
+        let total = (seconds * measurements as f64).ceil() as u64;
         let bench = Bench {
             context,
             interrupted: interrupt::flag("stopping")?,
-            seconds: args.seconds,
+            seconds,
             folder,
             progress: RefCell::new(Progress::new(context, "bench", total)),
             measured: Cell::new(0.0),
@@ -173,39 +246,33 @@ impl<'c> Bench<'c> {
         Ok(bench)
     }
 
-    /// Both stages of a preset.
-    fn preset(&self, name: &str, rays: Option<u32>, roofs: &Roofs) -> anyhow::Result<Vec<Value>> {
-        let config = with_rays(Config::preset(name)?, rays);
-        let second = config.second_stage().map(|second| (2, second));
-        let mut measured = Vec::new();
-        for (stage, config) in std::iter::once((1, config)).chain(second) {
-            let what = format!("{name}, stage {stage}, {} rays", config.rays);
-            let (timed, device_bytes) = self.time(&config, &what)?;
-            self.context
-                .say(&format!("\n{what}\n{}", timed.text(roofs)));
-            let mut result = timed.to_json(roofs);
-            result["preset"] = name.into();
-            result["stage"] = stage.into();
-            result["rays"] = config.rays.into();
-            result["device_bytes"] = device_bytes.into();
-            measured.push(result);
+    /// Both stages of each preset, added to `measured` as they come.
+    fn presets(&self, presets: &[Config], roofs: &Roofs, measured: &mut Vec<Value>) -> Result<()> {
+        for first in presets {
+            let second = first.second_stage();
+            for (stage, config) in std::iter::once(first).chain(&second).enumerate() {
+                let (name, stage) = (&first.preset, stage + 1);
+                let what = format!("{name}, stage {stage}, {} rays", config.rays);
+                let (timed, device_bytes) = self.time(config, &what)?;
+                self.context
+                    .say(&format!("\n{what}\n{}", timed.text(roofs)));
+                let mut result = timed.to_json(roofs);
+                result["preset"] = name.as_str().into();
+                result["stage"] = stage.into();
+                result["rays"] = config.rays.into();
+                result["device_bytes"] = device_bytes.into();
+                measured.push(result);
+            }
         }
-        Ok(measured)
+        Ok(())
     }
 
-    /// Steps of outdoor-large by the size of its dictionary, both stages with as many rays, and their ratio to those at 2^19.
-    fn dictionary(
-        &self,
-        sizes: &[u32],
-        rays: Option<u32>,
-        roofs: &Roofs,
-    ) -> anyhow::Result<Vec<Value>> {
-        let mut rows: Vec<Value> = Vec::new();
-        for &log2_size in sizes {
-            let mut config = with_rays(Config::preset("outdoor-large")?, rays);
-            config.hash.log2_size = log2_size;
+    /// Steps of outdoor-large by the size of its dictionary, both stages with as many rays, added to `rows` as they come.
+    fn dictionary(&self, sizes: &[Config], roofs: &Roofs, rows: &mut Vec<Value>) -> Result<()> {
+        for config in sizes {
+            let log2_size = config.hash.log2_size;
             let what = format!("outdoor-large at 2^{log2_size}, {} rays", config.rays);
-            match self.time(&config.validated()?, &what) {
+            match self.time(config, &what) {
                 Ok((timed, device_bytes)) => {
                     let mut row = timed.to_json(roofs);
                     row["log2_size"] = log2_size.into();
@@ -216,37 +283,10 @@ impl<'c> Bench<'c> {
                 Err(Error::OutOfMemory { what }) => {
                     self.context.warn(&format!("2^{log2_size}: {what}"));
                 }
-                Err(error) => return Err(error.into()),
+                Err(error) => return Err(error),
             }
         }
-        if rows.is_empty() {
-            return Ok(rows);
-        }
-        let of = |row: &Value, key: &str| row[key].as_f64().unwrap_or(f64::NAN);
-        let base = rows.iter().find(|row| row["log2_size"] == 19);
-        let base = base.map(|row| [of(row, "cpu_ms_per_step"), of(row, "device_ms_per_step")]);
-        let mut text = String::from(
-            "\nstage 1 by dictionary   CPU ms    ratio   device ms    ratio        MiB\n",
-        );
-        for row in &mut rows {
-            let times = [of(row, "cpu_ms_per_step"), of(row, "device_ms_per_step")];
-            let ratios = base.map(|base| [times[0] / base[0], times[1] / base[1]]);
-            let shown = |ratio: Option<f64>| ratio.map_or("-".into(), |r| format!("{r:.3}"));
-            let _ = writeln!(
-                text,
-                "2^{:<20} {:>8.1} {:>8} {:>11.1} {:>8} {:>10.0}",
-                row["log2_size"],
-                times[0],
-                shown(ratios.map(|r| r[0])),
-                times[1],
-                shown(ratios.map(|r| r[1])),
-                of(row, "device_bytes") / f64::from(1 << 20)
-            );
-            row["ratio_of_cpu_ms"] = ratios.map(|r| r[0]).into();
-            row["ratio_of_device_ms"] = ratios.map(|r| r[1]).into();
-        }
-        self.context.say(&text);
-        Ok(rows)
+        Ok(())
     }
 
     /// Times steps of one configuration; also says how much device memory it takes.

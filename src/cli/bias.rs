@@ -3,7 +3,8 @@
 use super::progress::Progress;
 use super::scene_args::SceneArgs;
 use super::settings::SettingsArgs;
-use super::{Context, interrupt, render, train};
+use super::study::Study;
+use super::{Context, interrupt, render};
 use crate::Error;
 use crate::config::DensityKind;
 use crate::render::bias::{closed_form, on_plane};
@@ -112,17 +113,21 @@ fn train_both(
         }
         .into());
     };
-    let mut runs = Vec::new();
+    let mut study = Study::open(dataset, &args.settings, &args.scene)?;
+    study.settings.stage = Some(1);
+    study.check_held_out("distances are those of rays of held-out views")?;
+    let mut planned = Vec::new();
     for (name, method) in [("without", "ablation-c"), ("with", "neurodin")] {
-        let run = out.join(name);
-        context.say(&format!("\n{name} bias correction: {}", run.display()));
-        let settings = SettingsArgs {
-            method: Some(method.into()),
-            stage: Some(1),
-            ..args.settings.clone()
-        };
-        train::train_or_resume(dataset, &run, settings, args.scene.clone(), context)?;
-        runs.push((name, run));
+        let run = study.plan(out.join(name), method, 0)?;
+        run.check()?;
+        planned.push((name, run));
+    }
+    let mut runs = Vec::new();
+    for (name, run) in planned {
+        let place = run.run.display();
+        context.say(&format!("\n{name} bias correction: {place}"));
+        run.train(context)?;
+        runs.push((name, run.run));
     }
     Ok(runs)
 }
@@ -232,7 +237,8 @@ fn measure(
     let mut scene = trained.record.open(None, trained.config())?;
     let views: Vec<usize> = scene.split(Split::Test).take(args.views as usize).collect();
     if views.is_empty() {
-        return Err(Error::input(run, "no view was held out", "train with --holdout 8").into());
+        let next = "train with a --holdout of at most half as many as there are views";
+        return Err(Error::input(run, "no view was held out", next).into());
     }
     for &view in &views {
         let camera = &mut scene.views[view].camera;

@@ -7,13 +7,14 @@ use super::eval::{self, EvalArgs};
 use super::mesh::{self, MeshArgs, NO_SURFACE};
 use super::scene_args::{SceneArgs, numbers};
 use super::settings::SettingsArgs;
-use super::{Context, train};
-use crate::config::{Config, METHODS};
+use super::study::{Planned, Study};
+use super::{Context, destination};
+use crate::config::{AppearanceAtEval, Config, METHODS};
 use crate::mesh::{Mesh, read_mesh};
 use crate::picture::Rgb;
 use crate::picture::surface::{Eye, Lens, Visible, clay, sun_eye};
-use crate::scene::{Camera, Region, Split};
-use crate::train::run_directory::{RunDirectory, SceneRecord};
+use crate::scene::{Camera, Region, Scene, Split};
+use crate::train::run_directory::RunDirectory;
 use crate::{Error, Result};
 use clap::Args;
 use glam::{DMat4, dvec2};
@@ -31,7 +32,8 @@ Example:
   neurodin compare photos/ --out study --methods all --steps 4000 --seeds 3 --reference scan.ply --report compare.html
 
 Each method and seed becomes a run in --out, with its mesh and scores.json. What is there already is taken as it is, so that the same
-command goes on where it was stopped. The methods are those of `neurodin train --help`, at --method.")]
+command goes on where it was stopped; with another reference or resolution it is scored again, with other settings it is refused.
+A method that runs out of memory or of finite numbers leaves its place in the table empty, and is tried again the next time. The methods are those of `neurodin train --help`, at --method.")]
 pub(super) struct CompareArgs {
     /// Dataset to train on
     pub dataset: PathBuf,
@@ -72,6 +74,9 @@ pub(super) struct CompareArgs {
     /// Write the table and pictures of every mesh as one HTML file
     #[arg(long, value_name = "FILE")]
     pub report: Option<PathBuf>,
+    /// Replace that file if it exists
+    #[arg(long, requires = "report")]
+    pub force: bool,
     #[command(flatten)]
     pub settings: SettingsArgs,
     #[command(flatten)]
@@ -88,36 +93,121 @@ struct Scores {
     seconds_per_step: f64,
     /// Device memory while training.
     device_bytes: u64,
-    /// Of the held-out views, in the mean.
+    /// Of the held-out views, in the mean; `None` where there are none.
     psnr: Option<f64>,
     ssim: Option<f64>,
     /// Why there is no mesh, if so.
     no_mesh: Option<String>,
     /// Of the mesh, as `neurodin eval --mesh` has it, where there is a reference.
     geometry: Option<Value>,
+    scored: Scored,
+}
+
+/// How a run was scored.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Scored {
+    /// Of the mesh, in cells.
+    resolution: u32,
+    /// Of the rendered views.
+    appearance: AppearanceAtEval,
+    /// Absolute paths.
+    reference: Vec<PathBuf>,
+    thresholds: Vec<f64>,
+    crop: Option<[f64; 6]>,
+    unseen: bool,
+}
+
+impl Scored {
+    fn asked(args: &CompareArgs, config: &Config) -> Result<Scored> {
+        let absolute = |path: &PathBuf| {
+            fs::canonicalize(path).map_err(|error| Error::unreadable(path, &error))
+        };
+        Ok(Scored {
+            resolution: args.resolution,
+            appearance: config.appearance.at_eval,
+            reference: args.reference.iter().map(absolute).collect::<Result<_>>()?,
+            thresholds: args.thresholds.clone(),
+            crop: args.crop,
+            unseen: args.unseen,
+        })
+    }
+}
+
+/// A method under one seed.
+struct Entry<'a> {
+    method: String,
+    run: Planned<'a>,
 }
 
 pub(super) fn run(args: &CompareArgs, context: &Context) -> anyhow::Result<()> {
     let methods = methods(&args.methods)?;
-    // Hours may pass until it is needed.
+    // Hours may pass until they are needed.
+    if let Some(path) = &args.report {
+        destination::check(path, args.force)?;
+    }
     eval::read_reference(&args.reference)?;
-    let mut table = Table::default();
+    let study = Study::open(&args.dataset, &args.settings, &args.scene)?;
+    if let Err(error) = study.check_held_out("pictures are scored by held-out views") {
+        if args.reference.is_empty() {
+            return Err(error.into());
+        }
+        context.warn(&format!("only meshes will be scored: {error}"));
+    }
     // All methods under one seed, then under the next: a study that is stopped has compared.
+    let mut entries = Vec::new();
     for nth in 0..args.seeds {
         for method in &methods {
-            table.add(one_run(args, method, nth, context)?);
+            let run = study.plan(args.out.join(format!("{method}-{nth}")), method, nth)?;
+            run.check()?;
+            let method = method.clone();
+            entries.push(Entry { method, run });
         }
     }
-    let mut files = Vec::new();
-    if let Some(path) = &args.report {
-        context.say("\npictures");
-        let pictures = pictures(args, &methods)?;
-        let html = report::html(&table, &pictures, &args.dataset.display().to_string());
-        fs::write(path, html).map_err(|error| Error::unwritable(path, &error))?;
-        files.push(path);
+    let mut table = Table::default();
+    let mut failures = Vec::new();
+    for entry in &entries {
+        let (method, seed) = (&entry.method, entry.run.config.seed);
+        match one_run(args, &study.scene, entry, context) {
+            Ok(scores) => table.add(scores),
+            Err(error) if is_a_result(&error) => {
+                context.warn(&format!("{method}, seed {seed}: {error:#}"));
+                table.add_failure(method, seed, &format!("{error:#}"));
+                failures.push(error);
+            }
+            Err(error) => return Err(error),
+        }
     }
-    let result = json!({ "methods": table.to_json(), "report": files.first() });
-    Ok(context.result(&result, &format!("\n{}", table.text()))?)
+    let html = match &args.report {
+        None => None,
+        Some(_) => {
+            context.say("\npictures");
+            let pictures = pictures(args, &study.scene, &entries[..methods.len()])?;
+            let dataset = args.dataset.display().to_string();
+            Some(report::html(&table, &pictures, &dataset))
+        }
+    };
+    let result = json!({ "methods": table.to_json(), "report": args.report });
+    context.result(&result, &format!("\n{}", table.text()))?;
+    if let (Some(path), Some(html)) = (&args.report, html) {
+        destination::write(path, args.force, |file| file.write_all(html.as_bytes()))?;
+    }
+    let runs = format!("{} of {} runs", failures.len(), entries.len());
+    match failures.into_iter().next() {
+        None => Ok(()),
+        Some(first) => Err(first.context(format!(
+            "{runs} failed; the same command tries them again:\n{}",
+            table.failures()
+        ))),
+    }
+}
+
+/// Whether a run failed for what it is, so that the others may come through.
+fn is_a_result(error: &anyhow::Error) -> bool {
+    matches!(
+        error.downcast_ref(),
+        Some(Error::Numerical { .. } | Error::OutOfMemory { .. })
+    )
 }
 
 /// The methods that were named, each of which exists.
@@ -131,61 +221,72 @@ fn methods(named: &[String]) -> Result<Vec<String>> {
     Ok(named.to_vec())
 }
 
-/// Trains, extracts and scores one method under the nth seed, or what of that is still to do.
+/// Trains, extracts and scores one run, or what of that is still to do.
 fn one_run(
     args: &CompareArgs,
-    method: &str,
-    nth: u32,
+    scene: &Scene,
+    entry: &Entry,
     context: &Context,
 ) -> anyhow::Result<Scores> {
-    let mut settings = args.settings.clone();
-    settings.method = Some(method.into());
-    let first = settings.seed.unwrap_or(Config::default().seed);
-    let seed = first + nth;
-    settings.seed = Some(seed);
-    let run = directory(args, method, nth);
-    let finished = run.join("scores.json");
-    if let Ok(text) = fs::read_to_string(&finished) {
-        return match serde_json::from_str::<Scores>(&text) {
-            Ok(scores) if scores.method == method && scores.seed == seed => {
-                context.say(&format!("\n{method}, seed {seed}: done before"));
-                Ok(scores)
+    let Entry { method, run } = entry;
+    let seed = run.config.seed;
+    let asked = Scored::asked(args, &run.config)?;
+    let before = match fs::read_to_string(run.scores()) {
+        Err(_) => None,
+        Ok(text) => match serde_json::from_str::<Scores>(&text) {
+            Ok(scores) if scores.method == *method && scores.seed == seed => Some(scores),
+            _ => {
+                return Err(Error::input(
+                    run.scores(),
+                    format!("holds no scores of {method} with seed {seed}"),
+                    "remove it to have the run scored again, or give another --out",
+                )
+                .into());
             }
-            _ => Err(Error::input(
-                &finished,
-                format!("holds no scores of {method} with seed {seed}"),
-                "remove its directory to have it trained again, or give another --out",
-            )
-            .into()),
-        };
+        },
+    };
+    let mut scores = match before {
+        Some(scores) if scores.scored == asked => {
+            context.say(&format!("\n{method}, seed {seed}: done before"));
+            return Ok(scores);
+        }
+        Some(scores) => {
+            context.say(&format!("\n{method}, seed {seed}: scored again"));
+            scores
+        }
+        None => {
+            let place = run.run.display();
+            context.say(&format!("\n{method}, seed {seed}: {place}"));
+            let trained = run.train(context)?;
+            Scores {
+                method: method.clone(),
+                seed,
+                steps: trained.steps,
+                seconds_per_step: seconds_per_step(&run.run)?,
+                device_bytes: trained.device_bytes,
+                psnr: None,
+                ssim: None,
+                no_mesh: None,
+                geometry: None,
+                scored: asked.clone(),
+            }
+        }
+    };
+    let has_mesh = take_mesh(args, &run.run, context)?;
+    scores.no_mesh = (!has_mesh).then(|| NO_SURFACE.into());
+    if scene.split(Split::Test).next().is_some() {
+        let appearance = Some(asked.appearance);
+        let pictures = eval::pictures::score(&run.run, None, appearance, context, &mut |_, _| {})?;
+        (scores.psnr, scores.ssim) = (pictures.psnr(), pictures.ssim());
     }
-    context.say(&format!("\n{method}, seed {seed}: {}", run.display()));
-    let trained =
-        train::train_or_resume(&args.dataset, &run, settings, args.scene.clone(), context)?;
-    let has_mesh = take_mesh(args, &run, context)?;
-    let pictures = eval::pictures::score(&run, None, None, context, &mut |_, _| {})?;
-    let geometry = match has_mesh && !args.reference.is_empty() {
-        true => Some(score_mesh(args, &run.join("mesh.ply"))?),
+    scores.geometry = match has_mesh && !args.reference.is_empty() {
+        true => Some(score_mesh(args, &run.run.join("mesh.ply"))?),
         false => None,
     };
-    let scores = Scores {
-        method: method.into(),
-        seed,
-        steps: trained.steps,
-        seconds_per_step: seconds_per_step(&run)?,
-        device_bytes: trained.device_bytes,
-        psnr: pictures.psnr(),
-        ssim: pictures.ssim(),
-        no_mesh: (!has_mesh).then(|| NO_SURFACE.into()),
-        geometry,
-    };
+    scores.scored = asked;
     let text = serde_json::to_string_pretty(&scores).expect("plain numbers and text");
-    RunDirectory::open(&run)?.write(&finished, &text)?;
+    RunDirectory::open(&run.run)?.write(&run.scores(), &text)?;
     Ok(scores)
-}
-
-fn directory(args: &CompareArgs, method: &str, nth: u32) -> PathBuf {
-    args.out.join(format!("{method}-{nth}"))
 }
 
 /// Writes the run's mesh as `mesh.ply` into its directory; whether there is one, since to have none is a result.
@@ -233,13 +334,9 @@ struct Shown {
     picture: Rgb,
 }
 
-/// The reference, where it is a mesh, and every method's mesh under the first seed, from where the first held-out view was taken.
-fn pictures(args: &CompareArgs, methods: &[String]) -> anyhow::Result<Vec<Shown>> {
-    let first = RunDirectory::open(&directory(args, &methods[0], 0))?;
-    let record = SceneRecord::load(&first)?;
-    let latest = crate::train::checkpoint::latest(&first.checkpoints())?;
-    let scene = record.open(Some(&args.dataset), &latest.checkpoint.state().config)?;
-    let region = &record.region;
+/// The reference, where it is a mesh, and the meshes of these runs, from where the first held-out view was taken.
+fn pictures(args: &CompareArgs, scene: &Scene, entries: &[Entry]) -> anyhow::Result<Vec<Shown>> {
+    let region = entries[0].run.region();
     let view = scene.split(Split::Test).chain(0..1).next().unwrap_or(0);
     let view = &scene.views[view];
     let eye = eye(&view.camera, view.world_from_camera);
@@ -253,8 +350,8 @@ fn pictures(args: &CompareArgs, methods: &[String]) -> anyhow::Result<Vec<Shown>
             });
         }
     }
-    for method in methods {
-        let path = directory(args, method, 0).join("mesh.ply");
+    for Entry { method, run } in entries {
+        let path = run.run.join("mesh.ply");
         if path.is_file() {
             shown.push(Shown {
                 name: method.clone(),

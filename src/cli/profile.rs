@@ -1,20 +1,19 @@
 //! `neurodin profile`: where the time of a training step goes, kernel by kernel.
 
-use super::Context;
 use super::chosen::{Chosen, gpu_options, open_scene};
 use super::interrupt::{self, stop_if};
 use super::progress::Progress;
 use super::scene_args::SceneArgs;
 use super::settings::SettingsArgs;
 use super::timing::{STOPPED, Until, time};
+use super::{Context, destination};
+use crate::Error;
 use crate::gpu::{GpuOptions, Profile};
 use crate::train::Trainer;
-use crate::{Error, Result};
 use clap::Args;
 use serde_json::{Value, json};
-use std::fs::File;
-use std::io::{BufWriter, Write as _};
-use std::path::{Path, PathBuf};
+use std::io::{self, Write};
+use std::path::PathBuf;
 
 /// Time every kernel of some training steps
 #[derive(Args)]
@@ -47,20 +46,17 @@ pub(super) struct ProfileArgs {
 const STEPS: u64 = 50;
 
 pub(super) fn run(args: &ProfileArgs, context: &Context) -> anyhow::Result<()> {
-    if let Some(trace) = args
-        .trace
-        .as_ref()
-        .filter(|trace| trace.exists() && !args.force)
-    {
-        return Err(Error::output(
-            trace,
-            "exists already",
-            "name another file, or replace it with --force",
-        )
-        .into());
+    if let Some(trace) = &args.trace {
+        destination::check(trace, args.force)?;
     }
     // --steps is how many are timed; the run that they are the beginning of keeps its length.
-    let steps = args.settings.steps.unwrap_or(STEPS).max(1);
+    let steps = args.settings.steps.unwrap_or(STEPS);
+    if steps == 0 {
+        return Err(Error::Config {
+            what: "--steps 0: at least one step must be timed".into(),
+        }
+        .into());
+    }
     let settings = SettingsArgs {
         steps: None,
         ..args.settings.clone()
@@ -95,9 +91,6 @@ pub(super) fn run(args: &ProfileArgs, context: &Context) -> anyhow::Result<()> {
         },
     )?;
     drop(progress);
-    if let Some(path) = &args.trace {
-        write_trace(path, &timed.profile, &gpu.info().name)?;
-    }
     let mut result = json!({
         "device": gpu.info().name,
         "preset": config.preset,
@@ -107,25 +100,26 @@ pub(super) fn run(args: &ProfileArgs, context: &Context) -> anyhow::Result<()> {
     if let (Some(result), Value::Object(times)) = (result.as_object_mut(), timed.to_json(&roofs)) {
         result.extend(times);
     }
-    Ok(context.result(&result, &timed.text(&roofs))?)
+    context.result(&result, &timed.text(&roofs))?;
+    // What was measured has been said by now, whatever becomes of the file.
+    if let Some(path) = &args.trace {
+        destination::write(path, args.force, |file| {
+            write_trace(file, &timed.profile, &gpu.info().name)
+        })?;
+    }
+    Ok(())
 }
 
 /// Chrome's trace format: one complete event ("X") a launch, in microseconds.
-fn write_trace(path: &Path, profile: &Profile, device: &str) -> Result<()> {
-    let write = || -> std::io::Result<()> {
-        let mut file = BufWriter::new(File::create(path)?);
-        let named =
-            json!({ "ph": "M", "pid": 0, "name": "process_name", "args": { "name": device } });
-        write!(file, "{{\"traceEvents\":[\n{named}")?;
-        for event in &profile.events {
-            let line = json!({
-                "ph": "X", "pid": 0, "tid": 0, "name": &*event.row, "cat": &*event.call,
-                "ts": event.begin_ns as f64 * 1e-3, "dur": (event.end_ns - event.begin_ns) as f64 * 1e-3,
-            });
-            write!(file, ",\n{line}")?;
-        }
-        writeln!(file, "\n]}}")?;
-        file.flush()
-    };
-    write().map_err(|error| Error::unwritable(path, &error))
+fn write_trace(file: &mut dyn Write, profile: &Profile, device: &str) -> io::Result<()> {
+    let named = json!({ "ph": "M", "pid": 0, "name": "process_name", "args": { "name": device } });
+    write!(file, "{{\"traceEvents\":[\n{named}")?;
+    for event in &profile.events {
+        let line = json!({
+            "ph": "X", "pid": 0, "tid": 0, "name": &*event.row, "cat": &*event.call,
+            "ts": event.begin_ns as f64 * 1e-3, "dur": (event.end_ns - event.begin_ns) as f64 * 1e-3,
+        });
+        write!(file, ",\n{line}")?;
+    }
+    writeln!(file, "\n]}}")
 }

@@ -2,7 +2,9 @@
 
 use super::{SMALL, fails, neurodin, run, said, write_dataset};
 use serde_json::Value;
+use std::io::{BufRead, BufReader};
 use std::path::Path;
+use std::process::{Command, Stdio};
 
 #[test]
 fn bias_of_a_plane_of_a_dataset_and_of_a_run() {
@@ -87,7 +89,7 @@ fn methods_are_compared_and_a_study_goes_on() {
             &["compare", &photos, "--out", &study, "--methods", methods][..],
             &["--preset", "outdoor-tiny", "--steps", "8", "--seeds", "2"],
             &["--resolution", "24", "--reference", &points, "--unseen"],
-            &["--thresholds", "0.1,0.8", "--json", "--report"],
+            &["--thresholds", "0.1,0.8", "--json", "--force", "--report"],
             &[&path("compare.html")],
             &SMALL[..],
         ];
@@ -139,6 +141,70 @@ fn methods_are_compared_and_a_study_goes_on() {
     assert!(refused.stderr.contains("scores.json"), "{}", refused.stderr);
 }
 
+/// What is there is taken only for what it is: trained as is asked now, and scored as is asked now.
+#[test]
+fn runs_that_were_trained_otherwise_are_not_compared() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name).to_str().unwrap().to_string();
+    let (photos, study, page) = (path("photos"), path("study"), path("compare.html"));
+    write_dataset(Path::new(&photos));
+    let words = |more: &[&'static str]| -> Vec<String> {
+        let all = [
+            &["compare", &photos, "--out", &study][..],
+            &["--methods", "neuralangelo", "--preset", "outdoor-tiny"],
+            &SMALL[..],
+            &["--set", "seed=7"],
+            more,
+        ]
+        .concat();
+        all.into_iter().map(String::from).collect()
+    };
+    let compare = |more: &[&'static str]| {
+        let words = words(more);
+        let words: Vec<&str> = words.iter().map(String::as_str).collect();
+        said(neurodin(&words).output().unwrap())
+    };
+    let refused = |more: &[&'static str], code: i32, part: &str| {
+        let said = compare(more);
+        assert_eq!(said.code, Some(code), "{more:?}: {}", said.stderr);
+        assert!(said.stderr.contains(part), "{more:?}: {}", said.stderr);
+    };
+    // Whatever cannot be is said before anything is trained.
+    let small = ["--steps", "8", "--resolution", "24"];
+    refused(&["--stage", "2"], 3, "--stage 2");
+    refused(&["--set", "seed=4294967295", "--seeds", "2"], 3, "seed");
+    refused(&["--report", "no/such/r.html"], 8, "mkdir");
+    std::fs::write(&page, "precious").unwrap();
+    fails(
+        &["compare", &photos, "--out", &study, "--report", &page],
+        8,
+        &["--force"],
+    );
+    for command in ["compare", "bias"] {
+        let words = [command, &photos, "--out", &study, "--holdout", "0"];
+        fails(&words, 3, &["held out", "--holdout 4"]);
+    }
+    assert!(!Path::new(&study).exists(), "nothing was trained");
+
+    let first = compare(&[&small[..], &["--json"]].concat());
+    assert_eq!(first.code, Some(0), "{}", first.stderr);
+    let result: Value = serde_json::from_str(&first.stdout).unwrap();
+    assert_eq!(result["methods"][0]["runs"][0]["seed"], 7);
+    let longer = ["--steps", "12", "--resolution", "24"];
+    refused(&longer, 3, "steps: ");
+    refused(&[&small[..], &["--radius", "2"]].concat(), 3, "region: ");
+    refused(
+        &[&small[..], &["--set", "seed=8"]].concat(),
+        3,
+        "seed: 7 -> 8",
+    );
+    let again = compare(&[&small[..], &["--set", "report.log_steps=4"]].concat());
+    assert!(again.stderr.contains("done before"), "{}", again.stderr);
+    let finer = compare(&["--steps", "8", "--resolution", "32"]);
+    assert_eq!(finer.code, Some(0), "{}", finer.stderr);
+    assert!(finer.stderr.contains("scored again"), "{}", finer.stderr);
+}
+
 /// Points all over the unit sphere.
 fn write_ball(path: &Path) {
     let n = 2000;
@@ -181,6 +247,9 @@ fn a_bench_needs_no_dataset_and_two_are_compared() {
             .fold(0.0, f64::max);
         assert!(most > 0.01, "nothing comes near a roof: {most}");
     }
+    let again = bench(&path("a.json"));
+    assert_eq!(again.code, Some(8), "{}", again.stderr);
+    assert!(again.stderr.contains("--force"), "{}", again.stderr);
     assert_eq!(bench(&path("b.json")).code, Some(0));
     let between = run(&["bench", "--between", &path("a.json"), &path("b.json")]);
     assert_eq!(between.code, Some(0), "{}", between.stderr);
@@ -201,4 +270,44 @@ fn a_bench_needs_no_dataset_and_two_are_compared() {
         3,
         &["none.json"],
     );
+    for seconds in ["0", "nan", "inf", "soon"] {
+        fails(&["bench", "--seconds", seconds], 2, &["--seconds"]);
+    }
+    fails(&["bench", "--sizes", "50"], 3, &["log2_size"]);
+    fails(&["bench", "--out", &path("no/b.json")], 8, &["mkdir"]);
+    let photos = path("photos");
+    write_dataset(Path::new(&photos));
+    let trace = path("no/trace.json");
+    fails(&["profile", &photos, "--trace", &trace], 8, &["mkdir"]);
+    fails(&["profile", &photos, "--steps", "0"], 3, &["--steps 0"]);
+}
+
+/// What was measured before Ctrl-C is told, and told to be not all.
+#[test]
+#[cfg(unix)]
+fn an_interrupted_bench_tells_what_it_has() {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("bench.json");
+    let words = ["bench", "--presets", "outdoor-tiny", "--sizes", "0"];
+    let more = ["--seconds", "1", "--json", "--out", out.to_str().unwrap()];
+    let mut child = neurodin(&[&words[..], &more].concat())
+        .stderr(Stdio::piped())
+        .stdout(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut lines = BufReader::new(child.stderr.take().unwrap()).lines();
+    assert!(lines.any(|line| line.unwrap().starts_with("outdoor-tiny, stage 1")));
+    let killed = Command::new("kill")
+        .args(["-INT", &child.id().to_string()])
+        .status()
+        .unwrap();
+    assert!(killed.success());
+    let told: Vec<String> = lines.map(Result::unwrap).collect();
+    let stopped = child.wait_with_output().unwrap();
+    assert_eq!(stopped.status.code(), Some(130), "{told:?}");
+    let result: Value = serde_json::from_slice(&stopped.stdout).unwrap();
+    assert_eq!(result["incomplete"], true);
+    assert_eq!(result["presets"].as_array().map(Vec::len), Some(1));
+    let written = std::fs::read_to_string(&out).unwrap();
+    assert_eq!(serde_json::from_str::<Value>(&written).unwrap(), result);
 }

@@ -36,9 +36,13 @@ pub(super) fn compare(before: &Path, after: &Path) -> Result<(Value, String)> {
     for (name, file) in ["before", "after"].into_iter().zip(&files) {
         let _ = writeln!(
             text,
-            "{name:<7} {} on {}",
+            "{name:<7} {} on {}{}",
             file["version"].as_str().unwrap_or("?"),
-            file["device"].as_str().unwrap_or("?")
+            file["device"].as_str().unwrap_or("?"),
+            match file["incomplete"].as_bool() {
+                Some(true) => ", stopped before all was timed",
+                _ => "",
+            }
         );
     }
     let _ = write!(

@@ -40,7 +40,12 @@ pub(super) fn html(table: &Table, pictures: &[Shown], dataset: &str) -> String {
         }
         page.push_str("</tr>");
     }
-    page.push_str("</table></section><section><h2>Meshes</h2><div class=\"heroes\">");
+    page.push_str("</table>");
+    let failures = table.failures();
+    if !failures.is_empty() {
+        let _ = write!(page, "<p>Failed:</p><pre>{}</pre>", escape(&failures));
+    }
+    page.push_str("</section><section><h2>Meshes</h2><div class=\"heroes\">");
     for shown in pictures {
         let _ = write!(
             page,

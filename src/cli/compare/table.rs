@@ -1,6 +1,7 @@
 //! The table of a comparison: a row per method, a column per score, mean and spread over its seeds.
 
 use super::Scores;
+use serde::Serialize;
 use serde_json::{Value, json};
 use std::fmt::Write;
 
@@ -8,6 +9,17 @@ use std::fmt::Write;
 #[derive(Default)]
 pub(super) struct Table {
     rows: Vec<(String, Vec<Scores>)>,
+    failures: Vec<Failure>,
+}
+
+/// A run that came to nothing.
+#[derive(Serialize)]
+struct Failure {
+    #[serde(skip)]
+    method: String,
+    seed: u32,
+    /// What it failed with.
+    what: String,
 }
 
 /// A column: its head, how many decimals it has, whether more is better (or less), and its value for one run.
@@ -30,14 +42,36 @@ pub(super) struct Cell {
 
 impl Table {
     pub(super) fn add(&mut self, scores: Scores) {
-        match self
-            .rows
-            .iter_mut()
-            .find(|(name, _)| *name == scores.method)
-        {
-            Some((_, runs)) => runs.push(scores),
-            None => self.rows.push((scores.method.clone(), vec![scores])),
-        }
+        let method = scores.method.clone();
+        self.runs(&method).push(scores);
+    }
+
+    /// A method whose run failed has a row all the same.
+    pub(super) fn add_failure(&mut self, method: &str, seed: u32, what: &str) {
+        self.runs(method);
+        self.failures.push(Failure {
+            method: method.into(),
+            seed,
+            what: what.into(),
+        });
+    }
+
+    fn runs(&mut self, method: &str) -> &mut Vec<Scores> {
+        let at = self.rows.iter().position(|(name, _)| name == method);
+        let at = at.unwrap_or_else(|| {
+            self.rows.push((method.into(), Vec::new()));
+            self.rows.len() - 1
+        });
+        &mut self.rows[at].1
+    }
+
+    /// The runs that failed, one a line.
+    pub(super) fn failures(&self) -> String {
+        let lines = self.failures.iter().map(|failure| {
+            let Failure { method, seed, what } = failure;
+            format!("  {method}, seed {seed}: {what}")
+        });
+        lines.collect::<Vec<_>>().join("\n")
     }
 
     pub(super) fn methods(&self) -> impl Iterator<Item = &str> {
@@ -124,7 +158,8 @@ impl Table {
                     (column.head.clone(), value.into())
                 })
                 .collect();
-            json!({ "method": method, "means": means, "runs": runs })
+            let failures = self.failures.iter().filter(|of| of.method == *method);
+            json!({ "method": method, "means": means, "runs": runs, "failures": failures.collect::<Vec<_>>() })
         });
         rows.collect()
     }
@@ -159,6 +194,8 @@ impl Cell {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::cli::compare::Scored;
+    use crate::config::AppearanceAtEval;
 
     fn scores(method: &str, seed: u32, f: Option<f64>) -> Scores {
         Scores {
@@ -171,6 +208,14 @@ mod tests {
             ssim: None,
             no_mesh: f.is_none().then(|| "none".into()),
             geometry: f.map(|f| json!({ "thresholds": [{ "threshold": 0.01, "f_score": f }], "chamfer_trimmed": 0.1 })),
+            scored: Scored {
+                resolution: 24,
+                appearance: AppearanceAtEval::Mean,
+                reference: Vec::new(),
+                thresholds: Vec::new(),
+                crop: None,
+                unseen: false,
+            },
         }
     }
 
@@ -199,5 +244,21 @@ mod tests {
         assert_eq!(table.cell("a", &columns[3]), None);
         assert!(table.text().contains("20.50 ± 0.71"), "{}", table.text());
         assert_eq!(table.to_json()[0]["means"]["MiB"]["mean"], 3.0);
+    }
+    #[test]
+    fn a_failed_run_has_its_place_and_no_numbers() {
+        let mut table = Table::default();
+        table.add_failure("a", 0, "not finite");
+        table.add(scores("b", 0, Some(0.5)));
+        assert_eq!(table.methods().collect::<Vec<_>>(), ["a", "b"]);
+        assert!(
+            (table.columns().iter()).all(|column| table.cell("a", column).is_none()),
+            "{}",
+            table.text()
+        );
+        let rows = table.to_json();
+        assert_eq!(rows[0]["failures"][0]["what"], "not finite");
+        assert_eq!(rows[1]["failures"].as_array().map(Vec::len), Some(0));
+        assert_eq!(table.failures(), "  a, seed 0: not finite");
     }
 }
