@@ -229,7 +229,7 @@ impl<'c> Bench<'c> {
         let total = (seconds * measurements as f64).ceil() as u64;
         let bench = Bench {
             context,
-            interrupted: interrupt::flag("stopping")?,
+            interrupted: interrupt::flag(context, "stopping")?,
             seconds,
             folder,
             progress: RefCell::new(Progress::new(context, "bench", total)),

@@ -249,7 +249,7 @@ fn measure(
     let config = trained.config();
     let rays = (config.rays * config.sampling.samples / args.samples).max(8);
     let viewer = trained.fine_viewer(&scene, rays, args.samples)?;
-    let interrupted = interrupt::flag("stopping")?;
+    let interrupted = interrupt::flag(context, "stopping")?;
     let mut progress = Progress::new(context, "bias", 100 * views.len() as u64);
     let mut measured = Vec::new();
     for (nth, &view) in views.iter().enumerate() {

@@ -3,8 +3,9 @@
 mod report;
 mod table;
 
-use super::eval::{self, EvalArgs};
+use super::eval::{self, EvalArgs, pictures::score};
 use super::mesh::{self, MeshArgs, NO_SURFACE};
+use super::render::Which;
 use super::scene_args::{SceneArgs, numbers};
 use super::settings::SettingsArgs;
 use super::study::{Planned, Study};
@@ -275,8 +276,18 @@ fn one_run(
     let has_mesh = take_mesh(args, &run.run, context)?;
     scores.no_mesh = (!has_mesh).then(|| NO_SURFACE.into());
     if scene.split(Split::Test).next().is_some() {
-        let appearance = Some(asked.appearance);
-        let pictures = eval::pictures::score(&run.run, None, appearance, context, &mut |_, _| {})?;
+        // Held-out views have no code of their own.
+        let frame = asked.appearance == AppearanceAtEval::Frame;
+        let appearance = (!frame).then_some(asked.appearance);
+        let place = &run.run;
+        let pictures = score(
+            place,
+            None,
+            Which::Test,
+            appearance,
+            context,
+            &mut |_, _| {},
+        )?;
         (scores.psnr, scores.ssim) = (pictures.psnr(), pictures.ssim());
     }
     scores.geometry = match has_mesh && !args.reference.is_empty() {

@@ -18,6 +18,7 @@ use super::chosen::gpu_options;
 use super::eval::pictures;
 use super::mesh::{self, MeshArgs};
 use super::progress::Progress;
+use super::render::Which;
 use super::scene_args::SceneArgs;
 use super::timing::{Timed, Until, time};
 use super::train::Task;
@@ -177,7 +178,7 @@ impl<'c> Demo<'c> {
         Ok(Demo {
             args,
             context,
-            interrupted: interrupt::flag("stopping")?,
+            interrupted: interrupt::flag(context, "stopping")?,
             began: Instant::now(),
             stages: Vec::new(),
         })
@@ -334,9 +335,14 @@ impl<'c> Demo<'c> {
     fn views(&mut self) -> anyhow::Result<Vec<Seen>> {
         let run = self.args.out.join(RUN);
         let mut pairs = Vec::new();
-        let scores = pictures::score(&run, None, None, self.context, &mut |rendered, picture| {
-            pairs.push((rendered, picture))
-        })?;
+        let scores = pictures::score(
+            &run,
+            None,
+            Which::Test,
+            None,
+            self.context,
+            &mut |rendered, picture| pairs.push((rendered, picture)),
+        )?;
         let seen = scores.views.into_iter().zip(pairs);
         Ok(seen
             .map(|(score, (rendered, picture))| Seen {

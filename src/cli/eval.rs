@@ -11,7 +11,7 @@ use glam::{DMat4, DVec3};
 use serde_json::{Value, json};
 
 use super::Context;
-use super::render::Appearance;
+use super::render::{Appearance, Which};
 use super::scene_args::numbers;
 use crate::eval::geometry::{
     Distances, GeometryOptions, GeometryScores, Reference, score_geometry,
@@ -25,6 +25,7 @@ use protocol::{Protocol, ProtocolArgs};
 #[derive(Args, Clone, Debug, Default)]
 #[command(after_help = "Examples:
   neurodin eval run/
+  neurodin eval run/ --split train --appearance frame
   neurodin eval --mesh mesh.ply --reference scan.ply --thresholds 0.005,0.01
   neurodin eval --mesh mesh.ply --reference true.ply --reference points.ply --crop -1,-1,0,1,1,2 --visible-from photos/ --json
   neurodin eval --mesh mesh.ply --reference scan.ply --align photos/meta_data.json
@@ -36,8 +37,17 @@ Thresholds, distances and boxes are in the coordinates of the reference, which a
 DTU's MATLAB files are read as .npz; a .mat file is refused with the line that converts it.")]
 #[command(group = clap::ArgGroup::new("scored").required(true).args(["run", "mesh"]))]
 pub struct EvalArgs {
-    /// Run directory: PSNR and SSIM of its held-out views
+    /// Run directory: PSNR and SSIM of its views
     pub run: Option<PathBuf>,
+    /// Which views
+    #[arg(
+        long,
+        value_enum,
+        default_value_t,
+        value_name = "SPLIT",
+        requires = "run"
+    )]
+    pub split: Which,
     /// Appearance code of the rendered views [default: as the run's settings say]
     #[arg(long, value_enum, value_name = "CODE", requires = "run")]
     pub appearance: Option<Appearance>,
@@ -83,7 +93,8 @@ pub(super) fn run(args: &EvalArgs, context: &Context) -> anyhow::Result<()> {
         (Some(run), _) => {
             let at_eval = args.appearance.map(Into::into);
             let dataset = args.dataset.as_deref();
-            let scores = pictures::score(run, dataset, at_eval, context, &mut |_, _| {})?;
+            let split = args.split;
+            let scores = pictures::score(run, dataset, split, at_eval, context, &mut |_, _| {})?;
             (scores.to_json(), scores.text())
         }
         (None, Some(mesh)) => score_mesh(args, mesh)?,

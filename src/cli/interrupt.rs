@@ -1,6 +1,6 @@
 //! Ctrl-C: the first asks for an orderly end, the second ends at once.
 
-use super::output;
+use super::Context;
 use crate::{Error, Result};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
@@ -10,23 +10,24 @@ static HANDLER: OnceLock<Arc<AtomicBool>> = OnceLock::new();
 /// What happens because of the first request, at this moment.
 static THEN: Mutex<&str> = Mutex::new("");
 
-/// The flag that the first interrupt (or termination) request sets. `then` says what happens because of it from now on.
+/// The flag that the first interrupt (or termination) request sets. `then` says what happens because of it from now on, in the way in
+/// which `context` speaks.
 ///
 /// # Errors
 /// If the handler cannot be installed.
-pub(super) fn flag(then: &'static str) -> anyhow::Result<Arc<AtomicBool>> {
+pub(super) fn flag(context: &Context, then: &'static str) -> anyhow::Result<Arc<AtomicBool>> {
     *THEN.lock().unwrap_or_else(PoisonError::into_inner) = then;
     if let Some(flag) = HANDLER.get() {
         return Ok(Arc::clone(flag));
     }
     let flag = Arc::new(AtomicBool::new(false));
-    let set = Arc::clone(&flag);
+    let (set, context) = (Arc::clone(&flag), context.clone());
     ctrlc::set_handler(move || {
         if set.swap(true, Ordering::SeqCst) {
             std::process::exit(130);
         }
         let then = *THEN.lock().unwrap_or_else(PoisonError::into_inner);
-        output::line(&format!("interrupted: {then}; once more stops at once"));
+        context.say(&format!("interrupted: {then}; once more stops at once"));
     })?;
     Ok(Arc::clone(HANDLER.get_or_init(|| flag)))
 }

@@ -200,7 +200,7 @@ fn surface(
     options: &ExtractOptions,
     context: &Context,
 ) -> anyhow::Result<(Mesh, ExtractStats)> {
-    let interrupted = interrupt::flag("stopping")?;
+    let interrupted = interrupt::flag(context, "stopping")?;
     let mut field = Field::new(gpu, trained.config(), &trained.model, trained.annealed())?;
     let mut stage = None;
     let mut shown: Option<Progress> = None;

@@ -78,7 +78,7 @@ pub(super) fn run(args: &ProfileArgs, context: &Context) -> anyhow::Result<()> {
     context.say(&format!("device   {}", gpu.info().name));
     let roofs = gpu.measure_roofs()?;
     let mut trainer = Trainer::new(&gpu, &scene, &chosen.region, &config)?;
-    let interrupted = interrupt::flag("stopping")?;
+    let interrupted = interrupt::flag(context, "stopping")?;
     let mut progress = Progress::new(context, "profile", config.first_step + args.warmup + steps);
     let timed = time(
         &gpu,

@@ -61,13 +61,24 @@ pub(super) struct RenderArgs {
 }
 
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
-pub(super) enum Which {
+pub enum Which {
     /// Held-out views
     #[default]
     Test,
     /// Views that were trained with
     Train,
     All,
+}
+
+impl Which {
+    /// The views of a scene that are meant.
+    pub fn of(self, scene: &Scene) -> Vec<usize> {
+        match self {
+            Which::Test => scene.split(Split::Test).collect(),
+            Which::Train => scene.split(Split::Train).collect(),
+            Which::All => (0..scene.views.len()).collect(),
+        }
+    }
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
@@ -120,14 +131,7 @@ pub(super) fn run(args: &RenderArgs, context: &Context) -> anyhow::Result<()> {
             .camera
             .scaled(reduced(view.camera.width), reduced(view.camera.height));
     }
-    let wanted: Vec<usize> = (0..scene.views.len())
-        .filter(|view| {
-            matches!(
-                (args.split, scene.views[*view].split),
-                (Which::All, _) | (Which::Test, Split::Test) | (Which::Train, Split::Train)
-            )
-        })
-        .collect();
+    let wanted = args.split.of(&scene);
     if wanted.is_empty() {
         return Err(Error::Config {
             what: format!(
@@ -147,7 +151,7 @@ pub(super) fn run(args: &RenderArgs, context: &Context) -> anyhow::Result<()> {
     let names = file_names(&scene);
     let usual = trained.config().appearance.at_eval;
     let viewer = trained.viewer(&scene, args.appearance.map_or(usual, Into::into))?;
-    let interrupted = interrupt::flag("stopping after what is written")?;
+    let interrupted = interrupt::flag(context, "stopping after what is written")?;
     let pixels = |view: usize| {
         let camera = &scene.views[view].camera;
         u64::from(camera.width) * u64::from(camera.height)

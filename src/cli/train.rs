@@ -400,7 +400,7 @@ impl Task {
     /// [`Error::Interrupted`] after Ctrl-C, with a checkpoint saved; those of writing the run directory and of [`Trainer::run`].
     pub fn run(mut self, force: bool, context: &Context) -> anyhow::Result<Done> {
         // From here on an interruption is an orderly one.
-        let interrupted = interrupt::flag("saving a checkpoint")?;
+        let interrupted = interrupt::flag(context, "saving a checkpoint")?;
         let run = match &self.resumed {
             Some(_) => RunDirectory::resume(&self.out)?,
             None => RunDirectory::create(&self.out, force)?,

@@ -576,11 +576,15 @@ fn a_run_from_photographs_to_mesh() {
     );
     assert_eq!(image::open(files[0].as_str().unwrap()).unwrap().width(), 24);
 
-    let scored = run(&["eval", &out, "--json"]);
-    assert_eq!(scored.code, Some(0), "{}", scored.stderr);
-    let result: Value = serde_json::from_str(&scored.stdout).unwrap();
-    let psnr = result["psnr"].as_f64().unwrap();
-    assert!((3.0..60.0).contains(&psnr), "{result}");
+    // Nine views, of which every fourth was held out.
+    for (split, views) in [("test", 3), ("train", 6), ("all", 9)] {
+        let scored = run(&["eval", &out, "--split", split, "--json"]);
+        assert_eq!(scored.code, Some(0), "{}", scored.stderr);
+        let result: Value = serde_json::from_str(&scored.stdout).unwrap();
+        assert_eq!(result["views"].as_array().unwrap().len(), views);
+        let psnr = result["psnr"].as_f64().unwrap();
+        assert!((3.0..60.0).contains(&psnr), "{result}");
+    }
 
     let trace = path("trace.json");
     let words = [

@@ -1,7 +1,8 @@
-//! The picture half of `neurodin eval`: PSNR and SSIM of a run's held-out views.
+//! The picture half of `neurodin eval`: PSNR and SSIM of a run's views.
 
 use crate::Error;
 use crate::cli::progress::Progress;
+use crate::cli::render::Which;
 use crate::cli::{Context, interrupt};
 use crate::config::AppearanceAtEval;
 use crate::eval::images::{psnr, ssim};
@@ -14,7 +15,7 @@ use std::fmt::Write;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
 
-/// How well a run renders its held-out views.
+/// How well a run renders its views.
 pub(in crate::cli) struct PictureScores {
     run: PathBuf,
     step: u64,
@@ -22,7 +23,7 @@ pub(in crate::cli) struct PictureScores {
     pub views: Vec<ViewScore>,
 }
 
-/// How alike a held-out view's rendering and photograph are.
+/// How alike a view's rendering and photograph are.
 pub(in crate::cli) struct ViewScore {
     pub name: String,
     /// In dB.
@@ -82,14 +83,16 @@ fn mean(present: Vec<f64>) -> Option<f64> {
     (!present.is_empty()).then(|| present.iter().sum::<f64>() / present.len() as f64)
 }
 
-/// Renders the held-out views of a run with the appearance code that `at_eval` or else its settings say, and compares them with their
+/// Renders views of a run with the appearance code that `at_eval` or else its settings say, and compares them with their
 /// photographs. `show` gets every pair; all of them at once might not fit into memory.
 ///
 /// # Errors
-/// Those of reading run and dataset; `Config` if no view was held out; whatever the device fails with.
+/// Those of reading run and dataset; `Config` if there are no such views, or some have no code of the kind that is asked for; whatever the
+/// device fails with.
 pub(in crate::cli) fn score(
     run: &Path,
     dataset: Option<&Path>,
+    which: Which,
     at_eval: Option<AppearanceAtEval>,
     context: &Context,
     show: &mut dyn FnMut(Rendered, Picture),
@@ -102,22 +105,40 @@ pub(in crate::cli) fn score(
         context.warn(&refused.to_string());
     }
     let scene = trained.record.open(dataset, trained.config())?;
-    let held_out: Vec<usize> = scene.split(Split::Test).collect();
-    if held_out.is_empty() {
+    let wanted = which.of(&scene);
+    if wanted.is_empty() {
         return Err(Error::Config {
             what: format!(
-                "{}: no view was held out, so there is nothing to compare with\n  next: train with --holdout 8",
-                run.root().display()
+                "{}: there are no such views; {} were trained with\n  next: --split train, or a run with a --holdout of at most half the views",
+                run.root().display(),
+                scene.split(Split::Train).count()
+            ),
+        }
+        .into());
+    }
+    let strangers = wanted
+        .iter()
+        .filter(|&&view| scene.views[view].split != Split::Train);
+    let strangers = strangers.count();
+    if at_eval == Some(AppearanceAtEval::Frame)
+        && trained.config().appearance.dims > 0
+        && strangers > 0
+    {
+        return Err(Error::Config {
+            what: format!(
+                "--appearance frame: {strangers} of {} views were not trained with, and have no code of their own\n  next: --split train, or \
+                 --appearance zero or mean",
+                wanted.len()
             ),
         }
         .into());
     }
     let viewer = trained.viewer(&scene, appearance)?;
-    let interrupted = interrupt::flag("stopping")?;
+    let interrupted = interrupt::flag(context, "stopping")?;
     let masked = trained.config().scene.masks.reads();
-    let mut progress = Progress::new(context, "eval", 100 * held_out.len() as u64);
+    let mut progress = Progress::new(context, "eval", 100 * wanted.len() as u64);
     let mut views = Vec::new();
-    for (nth, &view) in held_out.iter().enumerate() {
+    for (nth, &view) in wanted.iter().enumerate() {
         let name = &scene.views[view].name;
         let rendered = viewer.render(&scene, view, &mut |share| {
             progress.at(100 * nth as u64 + (100.0 * share) as u64, name);
