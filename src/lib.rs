@@ -7,6 +7,7 @@
 mod arrays;
 pub mod cli;
 pub mod config;
+mod destination;
 pub mod error;
 pub mod eval;
 pub mod gpu;

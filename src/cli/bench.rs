@@ -2,12 +2,13 @@
 
 mod between;
 
+use super::Context;
 use super::interrupt::{self, stop_if};
 use super::progress::Progress;
 use super::scene_args::SceneArgs;
 use super::timing::{STOPPED, Timed, Until, time};
-use super::{Context, destination};
 use crate::config::Config;
+use crate::destination;
 use crate::gpu::{DeviceKind, GpuOptions, Roofs, TableRoofs};
 use crate::scene::synthetic::SyntheticOptions;
 use crate::scene::{Region, Scene};

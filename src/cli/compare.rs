@@ -3,14 +3,15 @@
 mod report;
 mod table;
 
+use super::Context;
 use super::eval::{self, EvalArgs, pictures::score};
 use super::mesh::{self, MeshArgs, NO_SURFACE};
 use super::render::Which;
 use super::scene_args::{SceneArgs, numbers};
 use super::settings::SettingsArgs;
 use super::study::{Planned, Study};
-use super::{Context, destination};
 use crate::config::{AppearanceAtEval, Config, METHODS};
+use crate::destination;
 use crate::mesh::{Mesh, read_mesh};
 use crate::picture::Rgb;
 use crate::picture::surface::{Eye, Lens, Visible, clay, sun_eye};

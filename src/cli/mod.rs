@@ -5,7 +5,6 @@ mod bias;
 mod chosen;
 mod compare;
 pub mod demo;
-mod destination;
 mod devices;
 mod diagnostics;
 pub mod eval;

@@ -1,13 +1,14 @@
 //! `neurodin profile`: where the time of a training step goes, kernel by kernel.
 
+use super::Context;
 use super::chosen::{Chosen, gpu_options, open_scene};
 use super::interrupt::{self, stop_if};
 use super::progress::Progress;
 use super::scene_args::SceneArgs;
 use super::settings::SettingsArgs;
 use super::timing::{STOPPED, Until, time};
-use super::{Context, destination};
 use crate::Error;
+use crate::destination;
 use crate::gpu::{GpuOptions, Profile};
 use crate::train::Trainer;
 use clap::Args;

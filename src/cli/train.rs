@@ -85,10 +85,11 @@ pub(super) fn run(args: &TrainArgs, context: &Context) -> anyhow::Result<()> {
 
 /// Every setting on stdout: as TOML, or under `--json` as the object that it is.
 fn print_config(config: &Config, context: &Context) -> anyhow::Result<()> {
-    Ok(match context.prints_json() {
+    match context.prints_json() {
         true => context.result(&json!(config), "")?,
         false => context.print(&config.to_toml())?,
-    })
+    }
+    Ok(())
 }
 
 /// Trains on a dataset into `out`, or where a run of it is there already goes on with that.

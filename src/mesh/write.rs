@@ -3,16 +3,15 @@
 //! A file appears whole or not at all. Colours are sRGB bytes in PLY (`red green blue`), sRGB fractions after the position in OBJ, and
 //! linear 16-bit `COLOR_0` in GLB, as its specification wants.
 
-use std::fs::File;
-use std::io::{BufWriter, ErrorKind, Write};
+use std::io::Write;
 use std::path::Path;
 
 use glam::DVec3;
 use serde_json::json;
 
 use super::{Mesh, bounds};
+use crate::destination;
 use crate::ply::{self, Element, Scalar};
-use crate::whole_file::{self, folder_of};
 use crate::{Error, Result, srgb};
 
 /// File formats that meshes are written in.
@@ -53,19 +52,7 @@ impl MeshFormat {
 /// `Output` if the extension is unknown, the folder is missing, or the file exists and `force` is not set.
 pub fn check_destination(path: &Path, force: bool) -> Result<MeshFormat> {
     let format = MeshFormat::of(path)?;
-    if !folder_of(path).is_dir() {
-        return Err(Error::output(
-            path,
-            "its folder does not exist",
-            format!("mkdir -p {}", folder_of(path).display()),
-        ));
-    }
-    if path.is_dir() {
-        return Err(Error::output(path, "is a folder", "name a file"));
-    }
-    if !force && path.symlink_metadata().is_ok() {
-        return Err(exists(path));
-    }
+    destination::check(path, force)?;
     Ok(format)
 }
 
@@ -93,23 +80,10 @@ pub fn write_mesh(path: &Path, mesh: &Mesh, force: bool) -> Result<()> {
             "write a .ply",
         ));
     }
-    let write = |file: &mut File| {
-        let mut out = BufWriter::with_capacity(1 << 20, file);
-        match format {
-            MeshFormat::Ply => ply(&mut out, mesh),
-            MeshFormat::Obj => obj(&mut out, mesh),
-            MeshFormat::Glb => glb(&mut out, mesh),
-        }?;
-        out.flush()
-    };
-    let written = if force {
-        whole_file::replace(path, write)
-    } else {
-        whole_file::create(path, write)
-    };
-    written.map_err(|error| match error.kind() {
-        ErrorKind::AlreadyExists => exists(path),
-        _ => Error::unwritable(path, &error),
+    destination::write(path, force, |mut out| match format {
+        MeshFormat::Ply => ply(&mut out, mesh),
+        MeshFormat::Obj => obj(&mut out, mesh),
+        MeshFormat::Glb => glb(&mut out, mesh),
     })?;
     tracing::info!(
         file = %path.display(),
@@ -118,14 +92,6 @@ pub fn write_mesh(path: &Path, mesh: &Mesh, force: bool) -> Result<()> {
         "mesh written"
     );
     Ok(())
-}
-
-fn exists(path: &Path) -> Error {
-    Error::output(
-        path,
-        "exists already",
-        "choose another name, or overwrite it with --force",
-    )
 }
 
 /// Whether float32 would move vertices by more than a hundred-thousandth of the mesh's size: georeferenced coordinates, for example.

@@ -256,7 +256,7 @@ fn jpegs_that_are_cut_off_are_refused() {
     let dataset = with_ending(&rig, "jpg");
     for (name, _) in &rig.views {
         let noise = image::RgbImage::from_fn(rig.width, rig.height, |x, y| {
-            image::Rgb([x * 97 ^ y * 61, x * 31 + y * 7, x * y].map(|value| value as u8))
+            image::Rgb([(x * 97) ^ (y * 61), x * 31 + y * 7, x * y].map(|value| value as u8))
         });
         let file = fs::File::create(dataset.at(&format!("images/{name}.jpg"))).unwrap();
         JpegEncoder::new_with_quality(file, 90)

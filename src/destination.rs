@@ -1,4 +1,4 @@
-//! Files that a command writes beside what it says: looked at before its work begins, written whole when that is done.
+//! Files that somebody asked for: their place is looked at before work begins, and they are written whole when it is done.
 
 use crate::whole_file::{self, folder_of};
 use crate::{Error, Result};
@@ -10,7 +10,7 @@ use std::path::Path;
 ///
 /// # Errors
 /// [`Error::Output`] if the folder is missing, or something is there that `force` does not let replace.
-pub(super) fn check(path: &Path, force: bool) -> Result<()> {
+pub(crate) fn check(path: &Path, force: bool) -> Result<()> {
     if !folder_of(path).is_dir() {
         return Err(Error::output(
             path,
@@ -31,13 +31,13 @@ pub(super) fn check(path: &Path, force: bool) -> Result<()> {
 ///
 /// # Errors
 /// [`Error::Output`]; what was at `path` is then as it was.
-pub(super) fn write(
+pub(crate) fn write(
     path: &Path,
     force: bool,
     write: impl FnOnce(&mut dyn Write) -> io::Result<()>,
 ) -> Result<()> {
     let write = |file: &mut File| {
-        let mut out = BufWriter::new(file);
+        let mut out = BufWriter::with_capacity(1 << 20, file);
         write(&mut out)?;
         out.flush()
     };
