@@ -212,15 +212,19 @@ fn is_a_result(error: &anyhow::Error) -> bool {
     )
 }
 
-/// The methods that were named, each of which exists.
+/// The methods that were named, each of which exists, and each once.
 fn methods(named: &[String]) -> Result<Vec<String>> {
     if named == ["all"] {
         return Ok(METHODS.iter().map(|method| method.name.into()).collect());
     }
+    let mut methods = Vec::new();
     for name in named {
         Config::default().with_method(name)?;
+        if !methods.contains(name) {
+            methods.push(name.clone());
+        }
     }
-    Ok(named.to_vec())
+    Ok(methods)
 }
 
 /// Trains, extracts and scores one run, or what of that is still to do.

@@ -413,3 +413,15 @@ impl Params {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::uniform;
+
+    #[test]
+    fn every_bit_of_a_seed_counts() {
+        for bit in 0..32 {
+            assert_ne!(uniform(0, 5), uniform(1 << bit, 5), "bit {bit}");
+        }
+    }
+}

@@ -555,6 +555,17 @@ fn a_run_from_photographs_to_mesh() {
         &["mesh.ply", "exists"],
     );
 
+    // What the flags left nothing of is not the field's fault.
+    let none = path("none.ply");
+    let small = ["mesh", &out, "-o", &none, "--resolution", "24"];
+    for flag in [
+        ["--crop", "50,50,50,51,51,51"],
+        ["--min-faces", "100000000"],
+    ] {
+        fails(&[&small[..], &flag[..]].concat(), 3, &flag);
+        assert!(!Path::new(&none).exists());
+    }
+
     let pictures = path("pictures");
     let rendered = run(&[
         "render",

@@ -111,10 +111,11 @@ fn methods_are_compared_and_a_study_goes_on() {
     write_ball(Path::new(&points));
     let first = compare("neuralangelo");
     assert_eq!(first.code, Some(0), "{}", first.stderr);
-    let both = compare("neurodin,neuralangelo");
+    let both = compare("neurodin,neuralangelo,neurodin"); // named twice, run once
     assert_eq!(both.code, Some(0), "{}", both.stderr);
     assert_eq!(both.stderr.matches("done before").count(), 2);
     let result: Value = serde_json::from_str(&both.stdout).unwrap();
+    assert_eq!(result["methods"].as_array().unwrap().len(), 2);
     for (nth, method) in ["neurodin", "neuralangelo"].into_iter().enumerate() {
         let row = &result["methods"][nth];
         assert_eq!(row["method"], method);

@@ -315,6 +315,21 @@ fn ten_thousand_steps(decay: f64, portable: bool) -> Result<()> {
     bench.check_device()
 }
 
+/// Where powers of β₂ run out of float32 within a sweep, the table is updated whole.
+#[test]
+fn too_short_a_memory_has_no_closed_form() -> Result<()> {
+    let gpu = Gpu::new(&GpuOptions::default())?;
+    for (beta2, lazy) in [(0.999, true), (0.9, true), (0.6, false), (0.0, false)] {
+        let optimizer = OptimizerConfig {
+            beta2,
+            ..Config::default().optimizer
+        };
+        let table = LazyTable::new(&gpu, &GRID, BEFORE, &optimizer, 1)?;
+        assert_eq!(table.is_some(), lazy, "{beta2}");
+    }
+    Ok(())
+}
+
 #[test]
 fn ten_thousand_steps_are_those_of_adamw() -> Result<()> {
     ten_thousand_steps(0.01, false)
