@@ -24,9 +24,6 @@ layout(push_constant, scalar) uniform Args {
     float most;            // share of a level's entries
 };
 
-// Steps after which a level that was mostly touched is marked again, to see whether it still is.
-const uint WHOLE = 64u;
-
 void main() {
     uint row = gl_LocalInvocationID.x;
     uint now = clock.at[0];
@@ -34,8 +31,8 @@ void main() {
     barrier();
     if (row < LEVELS) {
         LevelUse use = uses.at[row];
-        uint whole = mostly_touched(levels.at[row], use.touched, most) ? WHOLE : 0u;
-        uses.at[row] = LevelUse(0u, use.whole != 0u ? use.whole - 1u : whole);
+        bool mostly = float(use.marked) > most * float(levels.at[row].entries);
+        uses.at[row] = LevelUse(0u, use.whole != 0u ? use.whole - 1u : mostly ? WHOLE : 0u);
     }
     if (bad) return;
     uint next = (now + 1u) % READINGS;

@@ -1,5 +1,6 @@
 #version 460
-// AdamW of all parameters of those levels of the hash table (the slice) that are up to date as a whole; see table_update for the others.
+// AdamW of all parameters of those levels of the hash table (the slice) that are updated whole; of the others
+// entries wait until they are asked for (table_settle).
 #include "lib/prelude.glsl"
 #include "lib/hash_grid.glsl"
 #include "lib/lazy_table.glsl"

@@ -1,7 +1,8 @@
 //! The surface's hash table under an AdamW that changes only what a step needs, exactly (glsl/lib/lazy_table.glsl).
 //!
-//! A training step touches the entries around its points before it looks them up, and updates what it touched. In between, the rest of
-//! the table is behind by some updates; [`LazyTable::flush`] ends that for whoever reads all of it.
+//! A training step touches the entries around its points before it looks them up: each gets the update that its last gradient waits for,
+//! and those that it has missed since. So an entry is visited once in a step that asks for it, and in no other;
+//! [`LazyTable::flush`] ends the waiting for whoever reads all of the table.
 
 use super::hash_grid::HashGrid;
 use super::params::Params;
@@ -9,9 +10,10 @@ use crate::Result;
 use crate::config::OptimizerConfig;
 use crate::gpu::{Buffer, Gpu, Kernel, Ptr, Recorder, Work};
 use crate::kernels::{
-    ClockRow, Level, LevelUse, table_clock, table_flush, table_touch, table_update,
+    ClockRow, Level, LevelUse, table_clock, table_forget, table_mark, table_settle,
     table_update_whole,
 };
+use std::ops::Range;
 
 /// What one update is made of, beside gradients and moments: the factors of AdamW at its own step.
 #[derive(Clone, Copy, Debug)]
@@ -32,13 +34,11 @@ pub struct LazyTable {
     features: u32,
     /// Entries of the largest level.
     most_entries: u64,
-    /// Words of marks that one invocation goes through.
-    strip: u64,
     /// Share of a level's entries; where more are touched, the level is updated whole.
     most: f32,
-    /// Element offsets in the parameter block: of the table, and of the first of these levels.
+    /// Elements of the parameter block: the first of the table, and those of these levels.
     table: u64,
-    first: u64,
+    elements: Range<u64>,
     one_minus_beta1: f32,
     one_minus_beta2: f32,
     epsilon: f32,
@@ -46,14 +46,39 @@ pub struct LazyTable {
     rows: Buffer<ClockRow>, // [256]
     uses: Buffer<LevelUse>, // [levels]
     marks: Buffer<u32>,     // [slots / 32]
+    settled: Buffer<u32>,   // [slots / 32]
     stamps: Buffer<u32>,    // [slots / 4]
-    touch: Kernel<table_touch::Args>,
-    update: Kernel<table_update::Args>,
-    update_whole: Kernel<table_update_whole::Args>,
-    /// Parameters that a workgroup of `update_whole` goes over.
-    of_group: u64,
+    mark: Kernel<table_mark::Args>,
+    settle: Sweep<table_settle::Args>,
+    forget: Sweep<table_forget::Args>,
+    update_whole: Sweep<table_update_whole::Args>,
     tick: Kernel<table_clock::Args>,
-    catch_up: Kernel<table_flush::Args>,
+}
+
+/// A kernel that goes over a level, and the entries of a workgroup.
+struct Sweep<A> {
+    kernel: Kernel<A>,
+    of_group: u64,
+}
+
+/// When entries are settled, and so which (glsl/table_settle.comp).
+enum Occasion {
+    /// Those that were marked.
+    Touch,
+    /// What this step's update leaves to be settled.
+    Update(u64),
+    /// All.
+    Flush,
+}
+
+impl<A> Sweep<A> {
+    /// Of an invocation that goes over so many entries.
+    fn new(kernel: Kernel<A>, entries: u64) -> Sweep<A> {
+        Sweep {
+            of_group: entries * u64::from(kernel.local_size()),
+            kernel,
+        }
+    }
 }
 
 /// Readings of the clock.
@@ -91,17 +116,20 @@ impl LazyTable {
         let n_levels = rows.len() as u32;
         let end = u64::from(last.offset) + u64::from(last.entries);
         let slots = (end / WORD + u64::from(n_levels) + 1) * WORD;
-        // Counted in bytes, touching and updating an entry is worth it for up to 65 % of them. A processor pays for finding them, too;
+        // Counted in bytes, settling an entry by itself is worth it for up to 65 % of them. A processor pays for finding them, too;
         // where between a fifth and a half it breaks even has not been measured well (tools/runs/throughput.md).
         let (strip, most) = match gpu.info().few_cores {
-            true => (16, 0.35),
+            true => (32, 0.35),
             false => (2, 0.65),
         };
         let whole = table_update_whole::Shape {
             features,
             ..table_update_whole::Shape::default()
         };
-        let update_whole = gpu.kernel(whole)?;
+        let forget = table_forget::Shape {
+            features,
+            ..table_forget::Shape::default()
+        };
         let levels = gpu.buffer("lazy levels", u64::from(n_levels))?;
         gpu.upload(&levels, 0, &rows)?;
         Ok(Some(LazyTable {
@@ -109,10 +137,10 @@ impl LazyTable {
             n_levels,
             features,
             most_entries: u64::from(last.entries),
-            strip: u64::from(strip),
             most,
             table,
-            first: table + u64::from(first.offset) * u64::from(features),
+            elements: table + u64::from(first.offset) * u64::from(features)
+                ..table + end * u64::from(features),
             one_minus_beta1: (1.0 - optimizer.beta1) as f32,
             one_minus_beta2: (1.0 - optimizer.beta2) as f32,
             epsilon: optimizer.epsilon as f32,
@@ -120,52 +148,43 @@ impl LazyTable {
             rows: gpu.buffer("table clock rows", READINGS)?,
             uses: gpu.buffer("table uses", u64::from(n_levels))?,
             marks: gpu.buffer("table marks", slots / WORD)?,
+            settled: gpu.buffer("table marks settled", slots / WORD)?,
             stamps: gpu.buffer("table stamps", slots / 4)?,
-            touch: gpu.kernel(table_touch::Shape {
-                levels: n_levels,
-                features,
-            })?,
-            update: gpu.kernel(table_update::Shape { features, strip })?,
-            of_group: 2 * u64::from(whole.turns) * u64::from(update_whole.local_size()),
-            update_whole,
+            mark: gpu.kernel(table_mark::Shape { levels: n_levels })?,
+            forget: Sweep::new(gpu.kernel(forget)?, WORD * u64::from(forget.turns)),
+            update_whole: Sweep::new(
+                gpu.kernel(whole)?,
+                2 * u64::from(whole.turns) / u64::from(features),
+            ),
             tick: gpu.kernel(table_clock::Shape { levels: n_levels })?,
-            catch_up: gpu.kernel(table_flush::Shape { features })?,
+            settle: Sweep::new(
+                gpu.kernel(table_settle::Shape { features, strip })?,
+                WORD * u64::from(strip),
+            ),
         }))
     }
 
     /// Element of the parameter block at which this begins to care; before it, the table is updated like all other parameters.
     pub fn first(&self) -> u64 {
-        self.first
+        self.elements.start
     }
 
-    /// Brings the entries around `points [3, n]` up to date and marks them; before a training step looks them up.
+    /// Brings the entries around `points [3, n]` up to date; before a training step looks them up.
     pub fn touch(&self, rec: &mut Recorder, params: &Params, points: Ptr<f32>, n: u32) {
-        let args = table_touch::Args {
+        let args = table_mark::Args {
             levels: self.levels.ptr(),
             points,
-            rows: self.rows.ptr(),
-            clock: self.clock.ptr(),
-            stamps: self.stamps.ptr(),
-            first_moment: params.first_moment().at(self.table),
-            second_moment: params.second_moment().at(self.table),
             uses: self.uses.ptr_mut(),
             marks: self.marks.ptr_mut(),
-            table: params.values().at_mut(self.table),
             n,
-            one_minus_beta1: self.one_minus_beta1,
-            one_minus_beta2: self.one_minus_beta2,
-            epsilon: self.epsilon,
         };
         let work = Work::items(u64::from(n)).slices(self.n_levels);
-        let entries = 8.0 * f64::from(self.features);
-        rec.run(
-            &self.touch,
-            work.flops(6.0 * entries).bytes(16.0 * entries),
-            args,
-        );
+        rec.run(&self.mark, work.flops(100.0).bytes(64.0), args);
+        self.settle(rec, params, Occasion::Touch);
     }
 
-    /// One AdamW step of the table; touched entries' gradients are consumed. `step` only has to differ from call to call by one.
+    /// One AdamW step of the table, whose gradients are consumed now or when their entries are asked for again. `step` only has to differ
+    /// from call to call by one.
     pub fn update(
         &self,
         rec: &mut Recorder,
@@ -179,36 +198,19 @@ impl LazyTable {
             decay,
             correction,
         } = *rates;
-        let args = table_update::Args {
+        let args = table_forget::Args {
             levels: self.levels.ptr(),
-            uses: self.uses.ptr(),
-            rows: self.rows.ptr(),
-            clock: self.clock.ptr(),
             bad_step: bad_step.ptr(),
-            table: params.values().at_mut(self.table),
+            marks: self.marks.ptr(),
             grads: params.d_value(self.table),
-            first_moment: params.first_moment().at_mut(self.table),
-            second_moment: params.second_moment().at_mut(self.table),
-            marks: self.marks.ptr_mut(),
-            stamps: self.stamps.ptr_mut(),
-            rate,
-            decay,
-            correction,
-            one_minus_beta1: self.one_minus_beta1,
-            one_minus_beta2: self.one_minus_beta2,
-            epsilon: self.epsilon,
-            most: self.most,
-            step: step as u32,
         };
-        // How much of the table it is, the device alone knows: an eighth, as an estimate.
-        let strips = self.most_entries.div_ceil(WORD * self.strip);
-        let of_strip = (WORD * self.strip * u64::from(self.features)) as f64 / 8.0;
-        let work = Work::items(strips).slices(self.n_levels);
         rec.run(
-            &self.update,
-            work.flops(15.0 * of_strip).bytes(32.0 * of_strip),
+            &self.forget.kernel,
+            self.over_levels(&self.forget, 0.0, 0.0),
             args,
         );
+        rec.fill(&self.marks, 0..self.marks.len(), 0);
+        rec.fill(&self.settled, 0..self.settled.len(), 0);
         let args = table_update_whole::Args {
             levels: self.levels.ptr(),
             uses: self.uses.ptr(),
@@ -226,12 +228,11 @@ impl LazyTable {
             one_minus_beta2: self.one_minus_beta2,
             epsilon: self.epsilon,
         };
-        let groups = (self.most_entries * u64::from(self.features)).div_ceil(self.of_group);
-        let of_group = self.of_group as f64 / 8.0; // most levels are not whole
-        let work = Work::groups(groups).slices(self.n_levels);
+        // How much of the table is whole the device alone knows: an eighth, as an estimate.
+        let of_entry = f64::from(self.features) / 8.0;
         rec.run(
-            &self.update_whole,
-            work.flops(15.0 * of_group).bytes(32.0 * of_group),
+            &self.update_whole.kernel,
+            self.over_levels(&self.update_whole, 15.0 * of_entry, 32.0 * of_entry),
             args,
         );
         let args = table_clock::Args {
@@ -248,37 +249,74 @@ impl LazyTable {
             most: self.most,
         };
         rec.run(&self.tick, Work::groups(1), args);
+        self.settle(rec, params, Occasion::Update(step));
     }
 
     /// Brings the whole table up to date: values and moments are those of AdamW, and what follows is what would follow if they had
     /// just been uploaded.
     pub fn flush(&self, rec: &mut Recorder, params: &Params) {
-        let args = table_flush::Args {
+        self.settle(rec, params, Occasion::Flush);
+        self.begin_anew(rec);
+    }
+
+    fn settle(&self, rec: &mut Recorder, params: &Params, occasion: Occasion) {
+        let args = table_settle::Args {
             levels: self.levels.ptr(),
             uses: self.uses.ptr(),
             rows: self.rows.ptr(),
             clock: self.clock.ptr(),
             marks: self.marks.ptr(),
-            stamps: self.stamps.ptr(),
+            settled: self.settled.ptr_mut(),
+            stamps: self.stamps.ptr_mut(),
             table: params.values().at_mut(self.table),
+            grads: params.d_value(self.table),
             first_moment: params.first_moment().at_mut(self.table),
             second_moment: params.second_moment().at_mut(self.table),
             one_minus_beta1: self.one_minus_beta1,
             one_minus_beta2: self.one_minus_beta2,
             epsilon: self.epsilon,
+            after_update: u32::from(matches!(occasion, Occasion::Update(_))),
+            everything: u32::from(matches!(occasion, Occasion::Flush)),
+            step: match occasion {
+                Occasion::Update(step) => step as u32,
+                _ => 0,
+            },
         };
-        let pairs = u64::from(self.features.div_ceil(2));
-        let work = Work::items(self.most_entries * pairs).slices(self.n_levels);
-        rec.run(&self.catch_up, work.flops(20.0).bytes(48.0), args);
-        self.reset(rec);
+        // How many are marked the device alone knows, and whether a level becomes whole.
+        let share = match occasion {
+            Occasion::Touch => 1.0 / 8.0,
+            Occasion::Update(_) => 1.0 / 64.0,
+            Occasion::Flush => 1.0,
+        };
+        let of_entry = share * f64::from(self.features);
+        rec.run(
+            &self.settle.kernel,
+            self.over_levels(&self.settle, 25.0 * of_entry, 32.0 * of_entry),
+            args,
+        );
     }
 
-    /// Forgets what entries have missed: values and moments stand as they are meant to be.
-    pub fn reset(&self, rec: &mut Recorder) {
+    /// One launch over all levels; operations and bytes of an entry.
+    fn over_levels<A>(&self, sweep: &Sweep<A>, flops: f64, bytes: f64) -> Work {
+        let of_group = sweep.of_group as f64;
+        Work::groups(self.most_entries.div_ceil(sweep.of_group))
+            .slices(self.n_levels)
+            .flops(flops * of_group)
+            .bytes(bytes * of_group)
+    }
+
+    /// Forgets what entries wait for and have missed: values and moments stand as they are meant to be.
+    pub fn reset(&self, rec: &mut Recorder, params: &Params) {
+        params.forget_gradients(rec, self.elements.clone());
+        self.begin_anew(rec);
+    }
+
+    fn begin_anew(&self, rec: &mut Recorder) {
         rec.fill(&self.clock, 0..self.clock.len(), 0);
         rec.fill(&self.rows, 0..self.rows.len(), 0);
         rec.fill(&self.uses, 0..self.uses.len(), 0);
         rec.fill(&self.marks, 0..self.marks.len(), 0);
+        rec.fill(&self.settled, 0..self.settled.len(), 0);
         rec.fill(&self.stamps, 0..self.stamps.len(), 0);
     }
 }

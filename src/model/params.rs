@@ -292,7 +292,8 @@ impl Draws {
 
 /// What a block that learns has beside its values.
 struct Learning {
-    grads: Buffer<f32>,         // [len] sums, zero between steps
+    /// [len] sums; between steps zero, but for those of a lazily updated table.
+    grads: Buffer<f32>,
     first_moment: Buffer<f32>,  // [len]
     second_moment: Buffer<f32>, // [len]
 }
@@ -387,6 +388,12 @@ impl Params {
     /// Where gradients are accumulated from this element of the block on.
     pub fn d_value(&self, first: u64) -> PtrMut<f32> {
         self.grads().at_mut(first * self.width)
+    }
+
+    /// Sets the gradients of these elements to zero.
+    pub fn forget_gradients(&self, rec: &mut Recorder, elements: std::ops::Range<u64>) {
+        let words = elements.start * self.width..elements.end * self.width;
+        rec.fill(self.grads(), words, 0);
     }
 
     /// Where the matrix's gradient is accumulated.

@@ -302,7 +302,7 @@ impl Trainer {
         }
         if let Some(table) = &self.model.table {
             self.gpu.submit("reset", |rec| {
-                table.reset(rec);
+                table.reset(rec, &self.model.params);
                 Ok(())
             })?;
         }

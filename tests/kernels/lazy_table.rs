@@ -4,7 +4,8 @@ use crate::harness::Random;
 use crate::optimizer::Adam;
 use neurodin::Result;
 use neurodin::config::{Config, OptimizerConfig};
-use neurodin::gpu::{Buffer, Gpu, GpuOptions, Recorder};
+use neurodin::gpu::{Buffer, Gpu, GpuOptions, Kernel, PtrMut, Recorder, Work};
+use neurodin::kernels::weight_gradient;
 use neurodin::model::{Group, HashGrid, Init, LazyTable, Params, ParamsPlan, Rates};
 use std::collections::BTreeSet;
 
@@ -23,6 +24,9 @@ struct Bench {
     gpu: Gpu,
     params: Params,
     lazy: LazyTable,
+    /// Adds a batch's gradients to those that are there: the weights of a layer of one input, which is 1, have those of its outputs.
+    add: Kernel<weight_gradient::Args>,
+    one: Buffer<f32>, // [1]
     batches: Vec<Batch>,
     /// [1] 0 and 1.
     bad_step: [Buffer<u32>; 2],
@@ -97,6 +101,15 @@ impl Bench {
             Ok(flag)
         };
         let bad_step = [flag(0)?, flag(1)?];
+        let add = gpu.kernel(weight_gradient::Shape {
+            inputs: 1,
+            outputs: 2 * entries() as u32,
+            bias: 0,
+            tile: 1,
+            rows: 0,
+        })?;
+        let one = gpu.buffer("one", 1)?;
+        gpu.upload(&one, 0, &[1.0])?;
         // Batches of all sizes: the largest touches most of the coarse levels. Their gradients are of all sizes, too: down to where ε
         // counts, and to where squares vanish in float32; and some entries are touched without one.
         let sizes = [1, 2, 3, 5, 8, 8, 20, 50, 90, 400];
@@ -144,6 +157,8 @@ impl Bench {
             gpu,
             params,
             lazy,
+            add,
+            one,
             batches,
             bad_step,
             dense: values.iter().map(|&x| [x as f32, 0.0, 0.0]).collect(),
@@ -164,7 +179,18 @@ impl Bench {
         let turned = step % 2 == 1;
         let gradients = &chosen.on_device[usize::from(turned)];
         let sign = if turned { -1.0 } else { 1.0 };
-        rec.copy(gradients, 0, self.params.grads(), BEFORE, gradients.len());
+        let args = weight_gradient::Args {
+            x: self.one.ptr(),
+            d_y: gradients.ptr(),
+            d_weight: self.params.d_value(BEFORE),
+            d_bias: PtrMut::NULL,
+            n: 1,
+            stride_x: 1,
+            chunk: 1,
+        };
+        let outputs = u64::from(self.add.local_size());
+        let blocks = gradients.len().div_ceil(outputs) as u32;
+        rec.run(&self.add, Work::groups(1).slices(blocks), args);
         let t = step as i32 + 1;
         let (beta1, beta2) = (self.optimizer.beta1, self.optimizer.beta2);
         let rates = Rates {
@@ -417,7 +443,7 @@ fn a_flushed_table_goes_on_like_an_uploaded_one() -> Result<()> {
         bench.gpu.upload(block, 0, values)?;
     }
     bench.gpu.submit("reset", |rec| {
-        bench.lazy.reset(rec);
+        bench.lazy.reset(rec, &bench.params);
         Ok(())
     })?;
     steps(&mut bench, 300..650)?;

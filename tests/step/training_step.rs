@@ -85,9 +85,11 @@ fn laplace_density_of_one_beta_with_analytic_gradient() -> Result<()> {
     check(method("volsdf-grid"), RegionShape::Sphere, 9, usual())
 }
 
+/// (With the rays of seed 9 what the samples add to beta's gradient cancels to a hundredth, and float32 leaves 1e-4 of it, more or less
+/// by the processor that a software device runs on.)
 #[test]
 fn sight_density_of_one_beta() -> Result<()> {
-    check(method("tuvr-grid"), RegionShape::Sphere, 9, usual())
+    check(method("tuvr-grid"), RegionShape::Sphere, 1, usual())
 }
 
 #[test]
