@@ -35,6 +35,7 @@ const uint SWEEP = 240u;  // steps
 // The update that an entry's gradient has been waiting for, then those that it missed.
 void settle(uint entry, uint slot, uint now) {
     // All is asked for before any of it is looked at: waiting for memory is what this costs.
+    uint of_four = stamps.at[slot >> 2u];
     AdamState x[PAIRS];
     vec2 g[PAIRS];
     [[unroll]] for (uint k = 0u; k < PAIRS; ++k) {
@@ -42,7 +43,7 @@ void settle(uint entry, uint slot, uint now) {
                          load_features(reading(second_moment), entry, k));
         g[k] = load_sums(grads, entry, k);
     }
-    uint stamp = stamp_in(stamps.at[slot >> 2u], slot);
+    uint stamp = stamp_in(of_four, slot);
     if (stamp == now) return;
     uint next = (stamp + 1u) % READINGS;
     ClockRow row = rows.at[next];
@@ -55,8 +56,8 @@ void settle(uint entry, uint slot, uint now) {
         store_features(second_moment, entry, k, row.lag.second * updated.v);
         clear_sums(grads, entry, k);
     }
-    // Its neighbours' stamps lie in the same word.
-    atomicXor(stamps.at[slot >> 2u], (stamp ^ now) << (8u * (slot & 3u)));
+    // The other stamps of the word belong to this strip, too.
+    stamps.at[slot >> 2u] = of_four ^ ((stamp ^ now) << (8u * (slot & 3u)));
 }
 
 void main() {

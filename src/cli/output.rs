@@ -16,7 +16,7 @@ use std::time::SystemTime;
 #[derive(Clone, Debug)]
 pub struct Context {
     device: Option<String>,
-    cache: Option<PathBuf>,
+    wanted_cache: Option<PathBuf>,
     autotune: bool,
     validation: bool,
     json: bool,
@@ -29,7 +29,7 @@ impl Context {
     pub(super) fn new(global: &Global, colored: bool) -> Context {
         Context {
             device: global.device.clone(),
-            cache: global.cache.clone().or_else(users_cache),
+            wanted_cache: global.cache.clone(),
             autotune: !global.no_autotune,
             validation: global.validation,
             json: global.json,
@@ -50,12 +50,24 @@ impl Context {
     /// Opens the device that was asked for, otherwise as `options` say.
     ///
     /// # Errors
-    /// [`Error::NoDevice`] if there is none.
+    /// [`Error::NoDevice`] if there is none; [`Error::Output`] if the cache folder that was asked for cannot be made.
     pub fn gpu_with(&self, options: GpuOptions) -> Result<Gpu> {
+        // The user's own cache folder may be missing and read-only; one that was asked for may not.
+        if let Some(folder) = &self.wanted_cache {
+            let made = std::fs::create_dir_all(folder);
+            let usable = made.and_then(|()| tempfile::tempfile_in(folder).map(drop));
+            usable.map_err(|error| {
+                Error::output(
+                    folder,
+                    format!("cannot be the cache folder: {error}"),
+                    "name a folder that can be written to, or leave --cache and NEURODIN_CACHE out",
+                )
+            })?;
+        }
         let gpu = Gpu::new(&GpuOptions {
             device: self.device.clone(),
             validation: self.validation || options.validation,
-            cache_dir: self.cache.clone(),
+            cache_dir: self.wanted_cache.clone().or_else(users_cache),
             autotune: self.autotune,
             ..options
         })?;

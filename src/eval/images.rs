@@ -3,6 +3,36 @@
 //! PSNR = −10 log₁₀ MSE. SSIM (Wang, Bovik, Sheikh & Simoncelli 2004) with an 11×11 Gaussian window of σ = 1.5, K₁ = 0.01, K₂ = 0.03,
 //! over the windows that lie inside the picture, per channel, then the mean of the channels.
 
+use crate::scene::Picture;
+
+/// PSNR and SSIM of a rendering `[height, width]` beside its photograph; with `masked`, of what the photograph's mask keeps.
+pub fn compare(rendered: &[[f32; 3]], photo: &Picture, masked: bool) -> (f64, Option<f64>) {
+    let counts = |pixel: &[u8]| !masked || pixel[3] >= 128;
+    let colors = photo.rgb();
+    // What does not count is made equal, and left out of the mean.
+    let ours: Vec<f32> = rendered
+        .iter()
+        .zip(photo.rgba.chunks_exact(4))
+        .flat_map(|(rgb, pixel)| {
+            [0, 1, 2].map(|c| match counts(pixel) {
+                true => rgb[c].clamp(0.0, 1.0),
+                false => f32::from(pixel[c]) / 255.0,
+            })
+        })
+        .collect();
+    let counted = photo
+        .rgba
+        .chunks_exact(4)
+        .filter(|pixel| counts(pixel))
+        .count();
+    let share = counted as f64 / rendered.len() as f64;
+    let (width, height) = (photo.width as usize, photo.height as usize);
+    (
+        psnr(&ours, &colors) + 10.0 * share.log10(),
+        ssim(&ours, &colors, width, height, 3),
+    )
+}
+
 /// Mean squared difference. Any shape.
 ///
 /// # Panics
@@ -100,4 +130,32 @@ fn blur(plane: &[f64], width: usize, height: usize, window: &[f64]) -> Vec<f64> 
     (0..(height - 2 * RADIUS) * out_width)
         .map(|at| dot(&mut rows[at..].iter().step_by(out_width).copied()))
         .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A rendering that is 0.1 off where the mask keeps it and wrong elsewhere has 20 dB.
+    #[test]
+    fn what_is_masked_out_does_not_count() {
+        let rendered: Vec<[f32; 3]> = (0..8)
+            .map(|i| if i < 4 { [0.5; 3] } else { [1.0; 3] })
+            .collect();
+        let photo = Picture {
+            width: 4,
+            height: 2,
+            rgba: (0..8)
+                .flat_map(|i| if i < 4 { [102, 102, 102, 255] } else { [0; 4] })
+                .collect(),
+        };
+        let (masked, _) = compare(&rendered, &photo, true);
+        assert!((masked - 20.0).abs() < 1e-3, "{masked}");
+        let (whole, ssim) = compare(&rendered, &photo, false);
+        assert!(
+            (whole + 10.0 * (0.5f64 * 0.01 + 0.5).log10()).abs() < 1e-3,
+            "{whole}"
+        );
+        assert_eq!(ssim, None, "too small for a window");
+    }
 }

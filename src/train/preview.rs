@@ -2,7 +2,7 @@
 
 use super::Trainer;
 use crate::config::Config;
-use crate::eval::psnr;
+use crate::eval::images::compare;
 use crate::render::Rendered;
 use crate::scene::{Camera, Picture, Scene, Split};
 use crate::srgb;
@@ -68,10 +68,8 @@ impl Trainer {
                     "make room or mend the permissions there, then go on with --resume",
                 )
             })?;
-        let shown: Vec<f32> = (rendered.rgb.iter().flatten())
-            .map(|channel| channel.clamp(0.0, 1.0))
-            .collect();
-        Ok(Some(psnr(&shown, &photo.rgb())))
+        let masked = self.config.scene.masks.reads();
+        Ok(Some(compare(&rendered.rgb, &photo, masked).0))
     }
 }
 

@@ -400,6 +400,11 @@ fn outputs_that_exist_exit_8_untouched() {
         8,
         &["notes.txt", "--force"],
     );
+    fails(
+        &["profile", &photos, "--cache", notes.to_str().unwrap()],
+        8,
+        &["notes.txt", "cannot be the cache folder", "--cache"],
+    );
     assert_eq!(fs::read_to_string(notes).unwrap(), "mine");
 }
 

@@ -5,7 +5,7 @@ use crate::cli::progress::Progress;
 use crate::cli::render::Which;
 use crate::cli::{Context, interrupt};
 use crate::config::AppearanceAtEval;
-use crate::eval::images::{psnr, ssim};
+use crate::eval::images::compare;
 use crate::render::Rendered;
 use crate::scene::{Picture, Split};
 use crate::train::run_directory::RunDirectory;
@@ -145,7 +145,7 @@ pub(in crate::cli) fn score(
             !interrupted.load(Ordering::SeqCst)
         })?;
         let picture = scene.load_picture(view)?;
-        let (psnr, ssim) = compare(&rendered, &picture, masked);
+        let (psnr, ssim) = compare(&rendered.rgb, &picture, masked);
         views.push(ViewScore {
             name: name.clone(),
             psnr,
@@ -159,68 +159,4 @@ pub(in crate::cli) fn score(
         appearance,
         views,
     })
-}
-
-/// PSNR and SSIM of a rendering; with `masked`, of what its mask keeps.
-fn compare(rendered: &Rendered, picture: &Picture, masked: bool) -> (f64, Option<f64>) {
-    let counts = |pixel: &[u8]| !masked || pixel[3] >= 128;
-    let photo = picture.rgb();
-    // What does not count is made equal, and left out of the mean.
-    let ours: Vec<f32> = rendered
-        .rgb
-        .iter()
-        .zip(picture.rgba.chunks_exact(4))
-        .flat_map(|(rgb, pixel)| {
-            [0, 1, 2].map(|c| match counts(pixel) {
-                true => rgb[c].clamp(0.0, 1.0),
-                false => f32::from(pixel[c]) / 255.0,
-            })
-        })
-        .collect();
-    let counted = picture
-        .rgba
-        .chunks_exact(4)
-        .filter(|pixel| counts(pixel))
-        .count();
-    let share = counted as f64 / rendered.rgb.len() as f64;
-    let (width, height) = (picture.width as usize, picture.height as usize);
-    (
-        psnr(&ours, &photo) + 10.0 * share.log10(),
-        ssim(&ours, &photo, width, height, 3),
-    )
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    /// A rendering that is 0.1 off where the mask keeps it and wrong elsewhere has 20 dB.
-    #[test]
-    fn what_is_masked_out_does_not_count() {
-        let rendered = Rendered {
-            width: 4,
-            height: 2,
-            rgb: (0..8)
-                .map(|i| if i < 4 { [0.5; 3] } else { [1.0; 3] })
-                .collect(),
-            depth: Vec::new(),
-            normal: Vec::new(),
-            accumulation: Vec::new(),
-        };
-        let picture = Picture {
-            width: 4,
-            height: 2,
-            rgba: (0..8)
-                .flat_map(|i| if i < 4 { [102, 102, 102, 255] } else { [0; 4] })
-                .collect(),
-        };
-        let (masked, _) = compare(&rendered, &picture, true);
-        assert!((masked - 20.0).abs() < 1e-3, "{masked}");
-        let (whole, ssim) = compare(&rendered, &picture, false);
-        assert!(
-            (whole + 10.0 * (0.5f64 * 0.01 + 0.5).log10()).abs() < 1e-3,
-            "{whole}"
-        );
-        assert_eq!(ssim, None, "too small for a window");
-    }
 }
