@@ -1,5 +1,6 @@
 #version 460
-// Background colour of a ray: C = Σ w c with σ = exp(out), w_i = (1 − e^{−σδ}) T_i on black (METHOD 2.6, 2.8). One ray per invocation.
+// Background colour of a ray: C = Σ w c with σ = exp(out), w_i = (1 − e^{−σδ}) T_i (Mildenhall et al. 2020, NeRF) on black.
+// One ray per invocation.
 #include "lib/prelude.glsl"
 #include "lib/volume.glsl"
 

@@ -1,6 +1,7 @@
 #version 460
-// Samples of the background field between a ray's exit point and `far` (METHOD 2.8): edges uniform in s with independent jitter,
-// disparity 1/t = s/far + (1 − s)/exit, `far` at least twice as far as the exit; positions at the midpoints. One ray per invocation.
+// Samples of the background field between a ray's exit point and `far`, as in NeuRodin's released code: edges uniform in s with
+// independent jitter, disparity 1/t = s/far + (1 − s)/exit; positions at the midpoints. Here `far` is at least twice as far as the exit.
+// One ray per invocation.
 // With CONTRACTION, x ↦ (2 − 1/‖x‖) x/‖x‖ beyond the unit sphere and halved, so that all space falls into the hash grid's cube;
 // without, the published uncontracted positions, whose indices wrap.
 #include "lib/prelude.glsl"

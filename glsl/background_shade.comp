@@ -1,6 +1,6 @@
 #version 460
 // Direction and appearance rows of the background's colour network, one sample per invocation: real spherical harmonics up to
-// degree 3 (16 of them) in the standard basis, and the ray's appearance code (METHOD 2.8).
+// degree 3 (16 of them) in the standard basis, and the ray's appearance code (after nerfstudio's nerfacto, as in NeuRodin's released code).
 #include "lib/prelude.glsl"
 #include "lib/background.glsl"
 

@@ -1,7 +1,7 @@
 #version 460
 // Hash grid, hidden layer and first output of a field in one pass, one point per invocation:
 //   z = [x, e(x)],  u = W₁z + b₁,  h = σ(u),  out = w₂·h + b₂.
-// The SDF and its taps, the proposal densities and the background density are all this kernel (METHOD 2.3, 2.4, 2.8).
+// The SDF and its taps, the proposal densities and the background density are all this kernel.
 // In two launches, PART 1 with a slice per level and then PART 2, it suits devices whose caches hold one level but not all of them.
 #include "lib/prelude.glsl"
 #include "lib/hash_grid.glsl"

@@ -1,5 +1,5 @@
 #version 460
-// Gradient of a field's first output with respect to position, by the chain rule, one point per invocation (METHOD 3):
+// Gradient of a field's first output with respect to position, by the chain rule, one point per invocation:
 //   s = σ'(u) ⊙ w₂,  a = W₁ᵀ s,  g = Jᵀ a  with J = ∂z/∂x = [I; ∂e/∂x].
 // a is kept: the hash table's gradient through g needs it (hash_grid_backward).
 #include "lib/prelude.glsl"

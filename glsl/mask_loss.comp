@@ -1,7 +1,7 @@
 #version 460
 #include "lib/prelude.glsl"
 #include "lib/supervision.glsl"
-// Binary cross-entropy of the accumulated weight against the object's mask, and its gradient, one invocation per ray (METHOD 12):
+// Binary cross-entropy of the accumulated weight against the object's mask, and its gradient, one invocation per ray:
 //     loss = -(m log a + (1 - m) log b),  a the accumulation, b = 1 - a what passes, both clipped to [1e-3, 1 - 1e-3]
 // The picture has b beside a, where the difference would have lost its digits. A clipped one has no gradient. A ray that misses the region has no say.
 layout(push_constant, scalar) uniform Args {

@@ -1,5 +1,6 @@
 #version 460
-// Rendered normals: Σ w n over a ray's samples with n = g/‖g‖ (METHOD 2.6; not normalised again), one ray per invocation.
+// Rendered normals: Σ w n over a ray's samples with n = g/‖g‖ (not normalised again, as in NeuRodin's released code).
+// One ray per invocation.
 #include "lib/prelude.glsl"
 #include "lib/normal.glsl"
 

@@ -1,7 +1,7 @@
 #version 460
 #include "lib/prelude.glsl"
 #include "lib/supervision.glsl"
-// Absolute error of the rendered z-depth where a sensor measured one, and its gradient, one invocation per ray (METHOD 12):
+// Absolute error of the rendered z-depth where a sensor measured one, and its gradient, one invocation per ray:
 //     loss = |c t - z|,  t the rendered distance along the ray, c the z-depth of a unit of it, z > 0 the sensor's; region units
 layout(push_constant, scalar) uniform Args {
     F32s image;       // [6, n_rays] of composite_forward

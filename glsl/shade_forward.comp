@@ -1,8 +1,8 @@
 #version 460
 // From the field's gradient at a sample to the colour network's input, one sample per invocation:
-//   g from taps (lib/taps.glsl), or where there are none from field_gradient,  eikonal term (‖g‖ − 1)²  (METHOD 4.2),
-//   with CURVATURE its loss λ/B |trace of the Hessian| from the taps (METHOD 11),
-//   direction encoding sin(2ᵏd), sin(2ᵏd + π/2) for k = 0…3, then d (METHOD 2.7).
+//   g from taps (lib/taps.glsl), or where there are none from field_gradient,  eikonal term (‖g‖ − 1)²,
+//   with CURVATURE its loss λ/B |trace of the Hessian| from the taps (Li et al. 2023, Neuralangelo),
+//   direction encoding sin(2ᵏd), sin(2ᵏd + π/2) for k = 0…3, then d (as in NeuRodin's released code).
 #include "lib/prelude.glsl"
 #include "lib/taps.glsl"
 #include "lib/shading.glsl"

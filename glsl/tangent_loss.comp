@@ -1,6 +1,6 @@
 #version 460
-// Tangent-normal loss and its gradients, one sample per invocation (METHOD 4.5): the angle between the normals n at a sample and n' beside
-// it, L = acos(clamp(n·n', ±(1 - 1e-6)))/π. Beyond the clamp there is no gradient.
+// Tangent-normal loss and its gradients, one sample per invocation (Rosu and Behnke 2023, PermutoSDF, as in NeuRodin's released code): the
+// angle between the normals n at a sample and n' beside it, L = acos(clamp(n·n', ±(1 - 1e-6)))/π. Beyond the clamp there is no gradient.
 #include "lib/prelude.glsl"
 #include "lib/tangent.glsl"
 

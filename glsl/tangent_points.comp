@@ -1,6 +1,7 @@
 #version 460
-// Points beside the samples for the tangent-normal loss, one sample per invocation (METHOD 4.5): q = m + 0.01 n × r, with the bin's
-// midpoint m, the unit normal n = g/‖g‖ at the bin's start and a random unit vector r.
+// Points beside the samples for the tangent-normal loss, one sample per invocation (Rosu and Behnke 2023, PermutoSDF):
+// q = m + 0.01 n × r, with a random unit vector r and, as in NeuRodin's released code, the bin's midpoint m but the unit normal n = g/‖g‖
+// at its start.
 #include "lib/prelude.glsl"
 #include "lib/sampling.glsl"
 #include "lib/tangent.glsl"

@@ -49,7 +49,8 @@ pub struct Config {
     pub report: ReportConfig,
 }
 
-/// What the second stage does differently (METHOD 1.1, 1.4): beside what stands here, an analytic gradient and no bias correction.
+/// What the second stage does differently, as in NeuRodin's released code: beside what stands here, an analytic gradient, a density along
+/// the line of sight and no bias correction.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Stage2Config {
@@ -163,7 +164,7 @@ pub struct HashConfig {
     pub release: ReleaseConfig,
 }
 
-/// Coarse to fine: levels whose features are still hidden from the network (METHOD 11).
+/// Coarse to fine: levels whose features are still hidden from the network (Li et al. 2023, Neuralangelo).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ReleaseConfig {
@@ -213,13 +214,13 @@ pub struct SurfaceConfig {
 
 impl SurfaceConfig {
     /// Radius of the sphere that the geometric initialisation makes the surface, about, in region units: with it the network is
-    /// 0.85 ‖x‖ + 0.12 − init_bias (measured at init_bias 0.5, METHOD 2.4).
+    /// 0.85 ‖x‖ + 0.12 − init_bias (measured on the networks of NeuRodin's released code, at init_bias 0.5).
     pub fn initial_radius(&self) -> f64 {
         ((self.init_bias - 0.12) / 0.85).max(0.0)
     }
 }
 
-/// How the gradient of the signed distance is had (METHOD 3).
+/// How the gradient of the signed distance is had (Wang et al. 2024, NeuRodin: another way in each stage).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum GradientKind {
@@ -238,7 +239,7 @@ pub enum TapStepKind {
     Level,
 }
 
-/// What the optical depth of a bin is a function of (METHOD 2.5, 11).
+/// What the optical depth of a bin is a function of; stages are NeuRodin's, as released.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum DensityKind {
@@ -340,7 +341,7 @@ pub enum BackgroundKind {
 pub struct LossConfig {
     pub eikonal: f64,
     pub interlevel: f64,
-    /// Tangent-normal consistency (METHOD 4.5); needs the analytic gradient.
+    /// Tangent-normal consistency (Rosu and Behnke 2023, PermutoSDF); needs the analytic gradient.
     pub tangent: f64,
     /// Accumulated weight against the object's mask; with `scene.masks = "foreground"`.
     pub mask: f64,
@@ -370,7 +371,7 @@ impl LossConfig {
     }
 }
 
-/// Mean |trace of the SDF's Hessian|, from taps (METHOD 11).
+/// Mean |trace of the SDF's Hessian|, from taps (Li et al. 2023, Neuralangelo).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CurvatureConfig {
@@ -379,7 +380,7 @@ pub struct CurvatureConfig {
     pub warmup: u64,
 }
 
-/// Explicit bias correction (METHOD 4.3).
+/// Explicit bias correction (Wang et al. 2024, NeuRodin).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct BiasConfig {

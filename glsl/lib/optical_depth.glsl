@@ -1,4 +1,4 @@
-// From a signed distance to the optical depth of a bin: the scale, and the densities of the methods (METHOD 2.5, 11), with derivatives.
+// From a signed distance to the optical depth of a bin: the scale, and the densities of the methods, with derivatives.
 #include "lib/scalar.glsl"
 
 layout(constant_id = 0) const uint DENSITY = 0;
@@ -53,7 +53,7 @@ BinDepth laplace_depth(float a, float inv_s, float bin) {
                     : BinDepth(bin * inv_s * (1.0 - tail), bin * d_a, 0.0, bin * (1.0 - d_tail));
 }
 
-// The same of a = f/|c| (TUVR): then the heaviest point lies equally far behind a plane whatever the angle.
+// The same of a = f/|c| (Zhang et al. 2023, TUVR): then the heaviest point lies equally far behind a plane whatever the angle.
 BinDepth sight_depth(float f, float c, float inv_s, float bin) {
     BinDepth depth = laplace_depth(f / abs(c), inv_s, bin);
     depth.d_cosine = -depth.d_sdf * f / (c * abs(c));

@@ -1,4 +1,4 @@
-// What the losses on masks, depths and normals share (METHOD 12): what is drawn with a pixel, and the gradient of its rendering.
+// What the losses on masks, depths and normals share: what is drawn with a pixel, and the gradient of its rendering.
 #include "lib/image.glsl"
 
 // Planes of what is drawn, [6, n_rays].

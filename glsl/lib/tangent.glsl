@@ -1,4 +1,4 @@
-// What the kernels of the tangent-normal loss share (METHOD 4.5).
+// What the kernels of the tangent-normal loss share (Rosu and Behnke 2023, PermutoSDF, as in NeuRodin's released code).
 #include "lib/normal.glsl"
 
 const float PI = 3.14159265359;

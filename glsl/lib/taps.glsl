@@ -1,7 +1,7 @@
 // Where the points lie around a sample from whose signed distances its gradient is had, and what is made of them. With unit vectors d_j,
 // whose Σ d_j d_jᵀ = TAPS/3 I, and f_j = f(x + δ d_j):
 //     g = 3/(TAPS δ) Σ d_j f_j,   trace of the Hessian = 6/(TAPS δ²) Σ (f_j − f(x))
-// Six taps lie along the axes, both ways (METHOD 3); four at the corners of a tetrahedron (METHOD 11).
+// Six taps lie along the axes, both ways (as in NeuRodin's released code); four at the corners of a tetrahedron (as in Neuralangelo's).
 
 layout(constant_id = 2) const uint TAPS = 6;  // 6 or 4; 0: the gradient is had otherwise
 const uint BLOCKS = 1u + TAPS;                // of points: samples, then their taps

@@ -54,7 +54,7 @@ pub struct Method {
     toml: &'static str,
 }
 
-/// Every method (METHOD 7, 11), NeuRodin first.
+/// Every method: NeuRodin, those that it is compared with, and the cases A to E of NeuRodin's ablation.
 pub const METHODS: &[Method] = &[
     Method {
         name: "neurodin",
@@ -495,7 +495,7 @@ mod tests {
         assert!(complaint(Config::preset("indor-tiny-huge")).contains("'indoor-tiny'"));
     }
 
-    /// The numbers that distinguish the published configurations (METHOD 1.1).
+    /// The numbers that distinguish the configurations of NeuRodin's released code (nerfstudio/configs/method_configs.py).
     #[test]
     fn published_differences() {
         let [outdoor, hall, room] = ["outdoor-large", "indoor-large", "indoor-small"]

@@ -204,7 +204,7 @@ impl SurfaceAttributes for Field<'_> {
                 .collect();
             // The network knows colours by the gradients that it was trained with, those of taps at their mean distance.
             let (rgb, _) = self.shade(chunk, &inward, self.color_step)?;
-            // The padding that compositing applies (METHOD 1.2).
+            // The padding that compositing applies (glsl/lib/volume.glsl).
             colors.extend(
                 rgb.into_iter()
                     .map(|c| c.map(|x| (1.002 * x - 0.001).clamp(0.0, 1.0))),

@@ -1,4 +1,4 @@
-//! Appearance codes: a learned vector for each training view (METHOD 2.7), and after them a row for evaluation that nothing trains.
+//! Appearance codes: a learned vector for each training view, and after them a row for evaluation that nothing trains.
 
 use super::params::{Draws, Group, Init, Params, ParamsPlan};
 use crate::Result;

@@ -1,4 +1,5 @@
-//! What a ray sees behind the region: nothing, one learned colour, or a learned radiance field (METHOD 2.8).
+//! What a ray sees behind the region: nothing, one learned colour, or a learned radiance field (after nerfstudio's nerfacto, as in
+//! NeuRodin's released code).
 
 use super::appearance::add_codes;
 use super::field::{Field, FieldBuffers, FieldShape, Scratch};

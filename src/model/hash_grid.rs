@@ -1,4 +1,4 @@
-//! Shape of a multi-resolution hash grid: levels, resolutions and sizes by tiny-cuda-nn's rules (METHOD 2.4).
+//! Shape of a multi-resolution hash grid (Müller et al. 2022): levels, resolutions and sizes by tiny-cuda-nn's rules.
 
 use crate::kernels::Level;
 

@@ -1,4 +1,4 @@
-//! A proposal network: a small density field that says where along a ray samples are worth taking (METHOD 2.3).
+//! A proposal network: a small density field that says where along a ray samples are worth taking (Barron et al. 2022, Mip-NeRF 360).
 
 use super::field::{Field, FieldBuffers, FieldShape, Scratch};
 use super::hash_grid::HashGrid;

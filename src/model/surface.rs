@@ -1,4 +1,4 @@
-//! The surface: SDF, scale, geometry features and the colour network (METHOD 2.4, 2.5, 2.7).
+//! The surface: SDF, scale, geometry features and the colour network (Wang et al. 2024, NeuRodin).
 
 use super::appearance::add_codes;
 use super::field::{Field, FieldBuffers, FieldShape, Scratch};

@@ -1,5 +1,5 @@
-//! The bias of a rendered surface: along a ray, the heaviest point need not be where the signed distance is zero (METHOD 4.3). How far
-//! apart they are, on a trained field and on a plane, where it is known in closed form.
+//! The bias of a rendered surface: along a ray, the heaviest point need not be where the signed distance is zero (Wang et al. 2024,
+//! NeuRodin). How far apart they are, on a trained field and on a plane, where it is known in closed form.
 
 use crate::Result;
 use crate::config::{DensityKind, ScaleKind};

@@ -1,4 +1,4 @@
-//! From samples to pixels and back: optical depth and quadrature (METHOD 2.5, 2.6, 11).
+//! From samples to pixels and back: optical depth (glsl/lib/optical_depth.glsl) and quadrature (Mildenhall et al. 2020, NeRF).
 
 use super::rays::Rays;
 use super::renderer::Annealed;

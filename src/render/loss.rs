@@ -1,4 +1,4 @@
-//! What is wrong with a batch: colour, eikonal, interlevel, bias and optional losses, their sums for the log (METHOD 4).
+//! What is wrong with a batch: colour, eikonal, interlevel, bias and optional losses, their sums for the log.
 
 use super::composite::{Composite, Look};
 use super::priors::Priors;
@@ -161,8 +161,8 @@ impl Loss {
         );
     }
 
-    /// Explicit bias correction (METHOD 4.3): asks the SDF just behind each ray's [`Loss::heaviest`] sample, and pushes it below zero
-    /// where it still is free space. Adds the gradients.
+    /// Explicit bias correction (Wang et al. 2024, NeuRodin): asks the SDF just behind each ray's [`Loss::heaviest`] sample, and pushes it
+    /// below zero where it still is free space. Adds the gradients.
     pub fn bias(&self, rec: &mut Recorder, model: &Model, scratch: &Scratch, weight: f32) {
         model.touch(rec, self.queries.ptr(), self.query_field.n);
         model.surface.probes.forward(

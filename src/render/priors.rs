@@ -1,4 +1,4 @@
-//! Depths and normals that are known beforehand, on the device beside the pictures, and what a batch drew of them (METHOD 12).
+//! Depths and normals that are known beforehand, on the device beside the pictures, and what a batch drew of them.
 
 use super::rays::{RayDraws, Rays, ViewTable};
 use crate::Result;

@@ -1,4 +1,4 @@
-//! Where samples lie along a ray: two rounds of proposals, then the shading samples (METHOD 2.3).
+//! Where samples lie along a ray: two rounds of proposals, then the shading samples (Barron et al. 2022, Mip-NeRF 360).
 
 use super::rays::{RayDraws, Rays};
 use super::renderer::Annealed;

@@ -1,5 +1,5 @@
-//! What is wanted of a ray besides its colour: masks, a sensor's depth, monocular depth and normals (METHOD 12). All are off by default;
-//! of those that are, there are neither buffers nor kernels.
+//! What is wanted of a ray besides its colour: masks, a sensor's depth, monocular depth and normals (the last two as in MonoSDF, Yu et al.
+//! 2022). All are off by default; of those that are, there are neither buffers nor kernels.
 //!
 //! Each is a mean over the batch's rays, in which those that know nothing count as zero; so is colour. A ray that misses the region or is
 //! masked out knows nothing.

@@ -1,4 +1,5 @@
-//! Tangent-normal consistency: the surface's normal just beside a sample should be that at the sample (METHOD 4.5).
+//! Tangent-normal consistency: the surface's normal just beside a sample should be that at the sample (Rosu and Behnke 2023, PermutoSDF,
+//! as in NeuRodin's released code).
 
 use super::composite::Look;
 use super::rays::RayDraws;

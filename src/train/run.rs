@@ -210,7 +210,7 @@ impl Trainer {
         Ok(Some(next))
     }
 
-    /// Takes the parameters, and nothing else, of the checkpoint at the end of the stage before this one (METHOD 1.4).
+    /// Takes the parameters, and nothing else, of the checkpoint at the end of the stage before this one, as NeuRodin's released code does.
     ///
     /// # Errors
     /// [`Error::Input`] if it is not the end of that stage, or of another model or region; what writing device memory fails with.

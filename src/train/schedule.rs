@@ -1,6 +1,6 @@
 //! Every number that changes with time, as a function of the step alone.
 //!
-//! Closed forms (METHOD 1.2, 1.3), k the time in schedule steps:
+//! Closed forms, those of NeuRodin's released code (release: of Neuralangelo's), k the time in schedule steps:
 //!   scale bound   A: 1/β ≥ a + (b - a) log₂(1 + min(k, K)/K);  B: a + (b - a) (e^{4x} - 1)/(e⁴ - 1), then on to c with (e^x - 1)/(e - 1)
 //!   bias weight   the form of A, from `weight_start` to `weight`
 //!   annealing     10x / (9x + 1), x = min(k/K, 1): exponent of the proposal weights (Barron et al. 2022)
@@ -202,7 +202,7 @@ fn exponential(start: f64, end: f64, x: f64) -> f64 {
 mod tests {
     use super::*;
 
-    /// The table of METHOD 1.3, to the digits printed there.
+    /// What the schedules of NeuRodin's released code come to, rounded.
     #[test]
     fn published_table() {
         let outdoor = Schedule::new(&Config::default());
@@ -249,7 +249,7 @@ mod tests {
         }
     }
 
-    /// The second stage's bound B, and everything else from anew (METHOD 1.3, 1.4).
+    /// The second stage's bound B, and everything else from anew, as in NeuRodin's released code.
     #[test]
     fn published_table_of_stage_2() {
         let first = Config::default();
@@ -278,7 +278,7 @@ mod tests {
         }
     }
 
-    /// Warm-up and both sides of every milestone (METHOD 1.2).
+    /// Warm-up and both sides of every milestone, as in NeuRodin's released code.
     #[test]
     fn learning_rates() {
         let schedule = Schedule::new(&Config::default());
