@@ -50,7 +50,7 @@ impl Context {
     /// Opens the device that was asked for, otherwise as `options` say.
     ///
     /// # Errors
-    /// [`Error::NoDevice`] if there is none; [`Error::Output`] if the cache folder that was asked for cannot be made.
+    /// [`Error::NoDevice`] if there is none; [`Error::Output`] if the cache folder that was asked for cannot be used.
     pub fn gpu_with(&self, options: GpuOptions) -> Result<Gpu> {
         // The user's own cache folder may be missing and read-only; one that was asked for may not.
         if let Some(folder) = &self.wanted_cache {
