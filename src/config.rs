@@ -12,6 +12,7 @@ mod resolve;
 mod validate;
 
 pub use difference::{Difference, Effect};
+pub(crate) use resolve::nearest;
 pub use resolve::{HUGE, METHODS, Method, PRESETS, Preset};
 
 /// All settings of a training run.

@@ -2,7 +2,7 @@
 
 use super::progress::Progress;
 use super::{Context, interrupt};
-use crate::config::AppearanceAtEval;
+use crate::config::{AppearanceAtEval, nearest};
 use crate::render::Rendered;
 use crate::scene::{Camera, Scene, Split};
 use crate::srgb::byte;
@@ -24,6 +24,7 @@ use std::sync::atomic::Ordering;
 Example:
   neurodin render run --split test --out pictures
   neurodin render run --split all --out pictures --what rgb,depth,normal
+  neurodin render run --view DSC_0042 --out pictures
 
 Files are named after the views: VIEW.png, VIEW.depth.png, VIEW.depth.exr, VIEW.normal.png, VIEW.normal.exr.
 Depth in EXR is along the optical axis in the input's units, 0 where nothing is; in PNG, near is bright.
@@ -34,6 +35,14 @@ pub(super) struct RenderArgs {
     /// Which views
     #[arg(long, value_enum, default_value_t, value_name = "SPLIT")]
     pub split: Which,
+    /// These views alone, of whichever split, by the names that their files get; commas between
+    #[arg(
+        long = "view",
+        value_name = "NAME",
+        value_delimiter = ',',
+        conflicts_with = "split"
+    )]
+    pub views: Vec<String>,
     /// Directory to write to
     #[arg(short, long, value_name = "DIR")]
     pub out: PathBuf,
@@ -131,7 +140,11 @@ pub(super) fn run(args: &RenderArgs, context: &Context) -> anyhow::Result<()> {
             .camera
             .scaled(reduced(view.camera.width), reduced(view.camera.height));
     }
-    let wanted = args.split.of(&scene);
+    let names = file_names(&scene);
+    let wanted = match args.views.is_empty() {
+        true => args.split.of(&scene),
+        false => views_named(&args.views, &names)?,
+    };
     if wanted.is_empty() {
         return Err(Error::Config {
             what: format!(
@@ -148,7 +161,6 @@ pub(super) fn run(args: &RenderArgs, context: &Context) -> anyhow::Result<()> {
             "give another --out",
         )
     })?;
-    let names = file_names(&scene);
     let usual = trained.config().appearance.at_eval;
     let viewer = trained.viewer(&scene, args.appearance.map_or(usual, Into::into))?;
     let interrupted = interrupt::flag(context, "stopping after what is written")?;
@@ -205,6 +217,27 @@ fn check_destination(out: &Path, force: bool) -> Result<()> {
     } else {
         Ok(())
     }
+}
+
+/// The views whose files get these names.
+///
+/// # Errors
+/// [`Error::Config`] for a name that none has, with the nearest one.
+fn views_named(wanted: &[String], names: &[String]) -> Result<Vec<usize>> {
+    let find = |name: &String| {
+        names.iter().position(|own| own == name).ok_or_else(|| {
+            let next = match nearest(name, names.iter().map(String::as_str)) {
+                Some(own) => format!("did you mean \"{own}\"?"),
+                None => format!("there are {}, from \"{}\" on", names.len(), names[0]),
+            };
+            Error::Config {
+                what: format!(
+                    "--view {name}: no view of the dataset has this name\n  next: {next}"
+                ),
+            }
+        })
+    };
+    wanted.iter().map(find).collect()
 }
 
 /// A file name without extension for each view: the picture's own, or with its folders where those are not all different.

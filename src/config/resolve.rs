@@ -367,7 +367,7 @@ fn slot<'t>(table: &'t mut Table, path: &[&str]) -> Result<&'t mut Value, String
 }
 
 /// The name most like `name`, if any is like it at all: by the whole path, or by its last part alone.
-fn nearest<'n>(name: &str, names: impl Iterator<Item = &'n str>) -> Option<&'n str> {
+pub(crate) fn nearest<'n>(name: &str, names: impl Iterator<Item = &'n str>) -> Option<&'n str> {
     let last = |path: &str| path.rsplit('.').next().unwrap_or(path).to_string();
     names
         .map(|existing| {
