@@ -12,6 +12,7 @@
 layout(constant_id = 7) const uint HEADS = 1;
 layout(constant_id = 8) const uint PART = 0;      // 0 everything, 1 the encoding of one level per slice, 2 the network
 layout(constant_id = 9) const uint STRAIGHT = 0;
+layout(constant_id = 10) const uint JACOBIAN = 0; // PART 1 keeps ∂e/∂x, for the gradient
 #include "lib/tile.glsl"
 
 layout(push_constant, scalar) uniform Args {
@@ -25,6 +26,7 @@ layout(push_constant, scalar) uniform Args {
     F32sMut inputs;      // [INPUTS, n] z, kept for the backward pass
     F32sMut hidden;      // [HIDDEN, n_hidden] h of the first n_hidden points, for further heads
     F32sMut first;       // [n] out
+    F32sMut jacobian;    // [3, LEVELS·FEATURES, n] ∂e/∂x, where JACOBIAN
     uint n;
     uint n_hidden;
     uint begin;          // the points of this launch
@@ -44,14 +46,20 @@ void main() {
         for (uint l = first_level; l < end_level; ++l) {
             Level level = levels.at[l];
             Cell cell = cell_of(level, x);
-            vec2 features[PAIRS];
-            [[unroll]] for (uint k = 0u; k < PAIRS; ++k) features[k] = vec2(0.0);
-            [[unroll]] for (uint corner = 0u; corner < 8u; ++corner) {
-                uint entry = corner_entry(level, cell, corner);
-                float weight = corner_weight(cell, corner);
-                [[unroll]] for (uint k = 0u; k < PAIRS; ++k) features[k] = fma(vec2(weight), load_features(table, entry, k), features[k]);
+            uint entries[8];
+            [[unroll]] for (uint corner = 0u; corner < 8u; ++corner) entries[corner] = corner_entry(level, cell, corner);
+            [[unroll]] for (uint k = 0u; k < PAIRS; ++k) {
+                vec2 corners[8];
+                [[unroll]] for (uint corner = 0u; corner < 8u; ++corner) corners[corner] = load_features(table, entries[corner], k);
+                Interpolation e = interpolate(corners, cell.weight);
+                [[unroll]] for (uint f = 2u * k; f < min(2u * k + 2u, FEATURES); ++f) {
+                    uint feature = l * FEATURES + f;
+                    inputs.at[(COORDINATES + feature) * n + point] = e.value[f % 2u];
+                    if (JACOBIAN == 0u) continue;
+                    vec3 slope = slope_of(level, e, f % 2u);
+                    [[unroll]] for (uint axis = 0u; axis < 3u; ++axis) jacobian.at[jacobian_row(axis, feature) * n + point] = slope[axis];
+                }
             }
-            [[unroll]] for (uint f = 0u; f < FEATURES; ++f) inputs.at[(COORDINATES + l * FEATURES + f) * n + point] = features[f / 2u][f % 2u];
         }
     }
     if (PART == 1u) return;

@@ -7,6 +7,7 @@
 #include "lib/field.glsl"
 
 layout(constant_id = 7) const uint STRAIGHT = 0;
+layout(constant_id = 8) const uint JACOBIAN = 0; // 1: field_forward has kept ∂e/∂x; 0: the table is looked up once more
 #include "lib/tile.glsl"
 
 layout(push_constant, scalar) uniform Args {
@@ -17,6 +18,7 @@ layout(push_constant, scalar) uniform Args {
     F32s head_weight;    // [HIDDEN]
     F32s points;         // [3, n] region frame
     F32s inputs;         // [INPUTS, n] z, as field_forward left them
+    F32s jacobian;       // [3, LEVELS·FEATURES, n] ∂e/∂x, where JACOBIAN
     F32sMut slopes;      // [INPUTS, n] a
     F32sMut gradient;    // [3, n] g, per region unit
     uint n;
@@ -44,6 +46,15 @@ void main() {
     [[unroll]] for (uint i = 0u; i < INPUTS; ++i) slopes.at[i * n + point] = a[i];
 
     vec3 g = COORDINATES != 0u ? vector_at(reading(slopes), point, n) : vec3(0.0);
+    if (JACOBIAN != 0u) {
+        [[unroll]] for (uint feature = 0u; feature < LEVELS * FEATURES; ++feature) {
+            [[unroll]] for (uint axis = 0u; axis < 3u; ++axis) {
+                g[axis] = fma(a[COORDINATES + feature], jacobian.at[jacobian_row(axis, feature) * n + point], g[axis]);
+            }
+        }
+        set_vector(gradient, point, n, g);
+        return;
+    }
     vec3 x = vector_at(points, point, n);
     for (uint l = 0u; l < LEVELS; ++l) {
         Level level = levels.at[l];
@@ -51,12 +62,13 @@ void main() {
         vec2 slope[PAIRS];
         slope[PAIRS - 1u] = vec2(0.0);
         [[unroll]] for (uint f = 0u; f < FEATURES; ++f) slope[f / 2u][f % 2u] = slopes.at[(COORDINATES + l * FEATURES + f) * n + point];
+        vec2 corners[8];
         [[unroll]] for (uint corner = 0u; corner < 8u; ++corner) {
             uint entry = corner_entry(level, cell, corner);
-            float value = 0.0;
-            [[unroll]] for (uint k = 0u; k < PAIRS; ++k) value += dot(slope[k], load_features(table, entry, k));
-            g += value * corner_slope(level, cell, corner);
+            corners[corner] = vec2(0.0);
+            [[unroll]] for (uint k = 0u; k < PAIRS; ++k) corners[corner].x += dot(slope[k], load_features(table, entry, k));
         }
+        g += slope_of(level, interpolate(corners, cell.weight), 0u);
     }
     set_vector(gradient, point, n, g);
 }

@@ -35,16 +35,17 @@ void main() {
             d_e[f / 2u][f % 2u] = d_inputs.at[row * count + item()];
             slope[f / 2u][f % 2u] = slopes.at[row * n + point];
         }
+        vec2 corners[8];
         [[unroll]] for (uint corner = 0u; corner < 8u; ++corner) {
             uint entry = corner_entry(level, cell, corner);
-            float first = 0.0, second = 0.0;
+            corners[corner] = vec2(0.0);
             [[unroll]] for (uint k = 0u; k < PAIRS; ++k) {
                 vec2 stored = load_features(table, entry, k);
-                first += dot(d_e[k], stored);
-                second += dot(slope[k], stored);
+                corners[corner] += vec2(dot(d_e[k], stored), dot(slope[k], stored));
             }
-            d_x += first * corner_slope(level, cell, corner) + second * corner_curvature(level, cell, corner, v);
         }
+        Interpolation e = interpolate(corners, cell.weight);
+        d_x += slope_of(level, e, 0u) + curvature_along(level, e, 1u, v);
     }
     set_vector(d_points, point, n, d_x);
 }

@@ -5,10 +5,13 @@
 #include "lib/hash_grid.glsl"
 #include "lib/field.glsl"
 
+layout(constant_id = 7) const uint JACOBIAN = 0; // 1: field_forward has kept ∂e/∂x; 0: the table is looked up once more
+
 layout(push_constant, scalar) uniform Args {
     Levels levels;
     F32s table;       // [entries, FEATURES]
     F32s points;      // [3, n]
+    F32s jacobian;    // [3, LEVELS·FEATURES, n] ∂e/∂x, where JACOBIAN
     F32s d_gradient;  // [3, n] v
     F32sMut tangents; // [INPUTS, end - begin] ȧ
     uint n;
@@ -19,18 +22,29 @@ layout(push_constant, scalar) uniform Args {
 void main() {
     uint point = begin + item(), count = end - begin;
     if (point >= end) return;
-    vec3 x = vector_at(points, point, n);
     vec3 v = vector_at(d_gradient, point, n);
     uint l = level_of_slice(LEVELS);
     if (COORDINATES != 0u && l == 0u) set_vector(tangents, item(), count, v);
+    if (JACOBIAN != 0u) {
+        [[unroll]] for (uint f = 0u; f < FEATURES; ++f) {
+            uint feature = l * FEATURES + f;
+            vec3 slope;
+            [[unroll]] for (uint axis = 0u; axis < 3u; ++axis) slope[axis] = jacobian.at[jacobian_row(axis, feature) * n + point];
+            tangents.at[(COORDINATES + feature) * count + item()] = dot(slope, v);
+        }
+        return;
+    }
+    vec3 x = vector_at(points, point, n);
     Level level = levels.at[l];
     Cell cell = cell_of(level, x);
-    vec2 tangent[PAIRS];
-    [[unroll]] for (uint k = 0u; k < PAIRS; ++k) tangent[k] = vec2(0.0);
-    [[unroll]] for (uint corner = 0u; corner < 8u; ++corner) {
-        uint entry = corner_entry(level, cell, corner);
-        float along = dot(corner_slope(level, cell, corner), v);
-        [[unroll]] for (uint k = 0u; k < PAIRS; ++k) tangent[k] = fma(vec2(along), load_features(table, entry, k), tangent[k]);
+    uint entries[8];
+    [[unroll]] for (uint corner = 0u; corner < 8u; ++corner) entries[corner] = corner_entry(level, cell, corner);
+    [[unroll]] for (uint k = 0u; k < PAIRS; ++k) {
+        vec2 corners[8];
+        [[unroll]] for (uint corner = 0u; corner < 8u; ++corner) corners[corner] = load_features(table, entries[corner], k);
+        Interpolation e = interpolate(corners, cell.weight);
+        [[unroll]] for (uint f = 2u * k; f < min(2u * k + 2u, FEATURES); ++f) {
+            tangents.at[(COORDINATES + l * FEATURES + f) * count + item()] = dot(slope_of(level, e, f % 2u), v);
+        }
     }
-    [[unroll]] for (uint f = 0u; f < FEATURES; ++f) tangents.at[(COORDINATES + l * FEATURES + f) * count + item()] = tangent[f / 2u][f % 2u];
 }

@@ -12,6 +12,9 @@ layout(constant_id = 6) const uint TILE = 8;         // hidden neurons per pass 
 
 const uint INPUTS = COORDINATES + LEVELS * FEATURES;
 
+// Row of ∂e/∂x, kept as [3, LEVELS·FEATURES, n].
+uint jacobian_row(uint axis, uint feature) { return axis * LEVELS * FEATURES + feature; }
+
 // log(1 + e^{100u})/100 without overflow; equal to the published form, which turns linear above 100u = 20, to 2e-11.
 float softplus(float u) { return max(u, 0.0) + 0.01 * log(1.0 + exp(-100.0 * abs(u))); }
 

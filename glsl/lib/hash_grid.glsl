@@ -76,11 +76,45 @@ vec3 corner_slope(Level level, Cell cell, uint corner) {
     return 0.5 * level.scale * side * w.yzx * w.zxy;
 }
 
-// (d² corner_weight / d x²) v: only the mixed derivatives are there.
-vec3 corner_curvature(Level level, Cell cell, uint corner, vec3 v) {
-    vec3 w = axis_weights(cell, corner), side = corner_side(corner);
-    vec3 sv = side * v;
-    return 0.25 * level.scale * level.scale * side * (sv.yzx * w.zxy + sv.zxy * w.yzx);
+// What lies between a cell's corners, of two quantities at once, and its derivatives along the cell's edges: the sum of corner_weight times
+// what the corners hold, axis by axis.
+struct Interpolation {
+    vec2 value;
+    vec2 slope[3];  // along x, y, z
+    vec2 mixed[3];  // along y and z, x and z, x and y; twice along one axis there is none
+};
+
+Interpolation interpolate(vec2 corners[8], vec3 w) {
+    vec2 x[4], dx[4];
+    [[unroll]] for (uint i = 0u; i < 4u; ++i) {
+        dx[i] = corners[2u * i + 1u] - corners[2u * i];
+        x[i] = fma(vec2(w.x), dx[i], corners[2u * i]);
+    }
+    vec2 xy[2], dx_y[2], x_dy[2], dx_dy[2];
+    [[unroll]] for (uint i = 0u; i < 2u; ++i) {
+        x_dy[i] = x[2u * i + 1u] - x[2u * i];
+        dx_dy[i] = dx[2u * i + 1u] - dx[2u * i];
+        xy[i] = fma(vec2(w.y), x_dy[i], x[2u * i]);
+        dx_y[i] = fma(vec2(w.y), dx_dy[i], dx[2u * i]);
+    }
+    Interpolation e;
+    e.slope[2] = xy[1] - xy[0];
+    e.mixed[0] = x_dy[1] - x_dy[0];
+    e.mixed[1] = dx_y[1] - dx_y[0];
+    e.mixed[2] = fma(vec2(w.z), dx_dy[1] - dx_dy[0], dx_dy[0]);
+    e.slope[0] = fma(vec2(w.z), e.mixed[1], dx_y[0]);
+    e.slope[1] = fma(vec2(w.z), e.mixed[0], x_dy[0]);
+    e.value = fma(vec2(w.z), e.slope[2], xy[0]);
+    return e;
+}
+
+// One quantity's derivative by x in [-1, 1]³.
+vec3 slope_of(Level level, Interpolation e, uint f) { return 0.5 * level.scale * vec3(e.slope[0][f], e.slope[1][f], e.slope[2][f]); }
+
+// Its second derivative by x, times v.
+vec3 curvature_along(Level level, Interpolation e, uint f, vec3 v) {
+    vec3 mixed = vec3(e.mixed[0][f], e.mixed[1][f], e.mixed[2][f]);
+    return 0.25 * level.scale * level.scale * (mixed.zxy * v.yzx + mixed.yzx * v.zxy);
 }
 
 // Whether two corners of a cell may share an entry. A corner's hash differs from corner 0's by the exclusive or of what its steps along

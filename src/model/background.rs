@@ -55,6 +55,7 @@ impl Background {
             coordinates: false,
             softplus: false,
             gradient: false,
+            jacobian: false,
         })
     }
 

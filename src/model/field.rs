@@ -26,6 +26,8 @@ pub struct FieldShape {
     pub softplus: bool,
     /// The first output's gradient with respect to position is asked for, and learned from.
     pub gradient: bool,
+    /// For it, devices with few cores may keep the encoding's Jacobian of every point: half of the look-ups, for 12 bytes a feature and point.
+    pub jacobian: bool,
 }
 
 impl FieldShape {
@@ -44,6 +46,11 @@ impl FieldShape {
             gradient: false,
             ..self
         }
+    }
+
+    /// Whether [`field_forward`] keeps ∂e/∂x for the kernels of the gradient, which else look the table up again.
+    fn keeps_jacobian(&self, gpu: &Gpu) -> bool {
+        self.gradient && self.jacobian && gpu.info().few_cores
     }
 
     /// Rows that only fields with a gradient need.
@@ -76,6 +83,8 @@ pub struct Field {
 
 /// Kernels of the first output's gradient g = Jᵀ a.
 struct GradientKernels {
+    /// The encoding that keeps its Jacobian, where the others read it.
+    encoding: Option<Kernel<field_forward::Args>>,
     gradient: Kernel<field_gradient::Args>,
     tangent: Kernel<field_tangent::Args>,
     points: Kernel<field_point_backward::Args>,
@@ -123,9 +132,16 @@ pub struct FieldBuffers {
 
 /// The gradient of a field's first output, and what its backward pass reads.
 pub struct Slope {
-    pub gradient: Buffer<f32>,   // [3, n] g, per region unit
-    pub d_gradient: Buffer<f32>, // [3, n]
-    slopes: Buffer<f32>,         // [inputs, n] a
+    pub gradient: Buffer<f32>,     // [3, n] g, per region unit
+    pub d_gradient: Buffer<f32>,   // [3, n]
+    slopes: Buffer<f32>,           // [inputs, n] a
+    jacobian: Option<Buffer<f32>>, // [3, hash features, n] ∂e/∂x, where it is kept
+}
+
+impl Slope {
+    fn jacobian(&self) -> PtrMut<f32> {
+        self.jacobian.as_ref().map_or(PtrMut::NULL, Buffer::ptr_mut)
+    }
 }
 
 impl FieldBuffers {
@@ -143,6 +159,10 @@ impl FieldBuffers {
                 gradient: planes("gradient", 3)?,
                 d_gradient: planes("d_gradient", 3)?,
                 slopes: planes("slopes", shape.inputs())?,
+                jacobian: match shape.keeps_jacobian(gpu) {
+                    true => Some(planes("jacobian", 3 * shape.grid.outputs())?),
+                    false => None,
+                },
             }),
             false => None,
         };
@@ -215,6 +235,8 @@ impl Field {
         let (grid_levels, features) = (shape.grid.levels, shape.grid.features);
         let coordinates = shape.coordinate_inputs();
         let second_order = u32::from(shape.gradient);
+        let keeps_jacobian = shape.keeps_jacobian(gpu);
+        let jacobian = u32::from(keeps_jacobian);
         let softplus = u32::from(shape.softplus);
         let bias = u32::from(hidden.bias.is_some());
         let tile = shape.hidden.min(8);
@@ -235,6 +257,7 @@ impl Field {
             heads: 1,
             part: 0,
             straight,
+            jacobian: 0,
         };
         let backward = field_backward::Shape {
             levels: grid_levels,
@@ -256,6 +279,7 @@ impl Field {
             backward_inputs,
             inputs_are_relu: false,
         };
+        let encoding = format!("{label} encoding");
         let forward_part = |part, heads, name: &str| -> Result<_> {
             let shape = field_forward::Shape {
                 part,
@@ -279,6 +303,18 @@ impl Field {
         let network = format!("{label} network");
         let by_chain_rule = match shape.gradient {
             true => Some(GradientKernels {
+                encoding: match keeps_jacobian {
+                    true => {
+                        let shape = field_forward::Shape {
+                            part: 1,
+                            heads: 0,
+                            jacobian,
+                            ..forward
+                        };
+                        Some(gpu.kernel(shape)?.labelled(&encoding))
+                    }
+                    false => None,
+                },
                 gradient: gpu
                     .kernel(field_gradient::Shape {
                         levels: grid_levels,
@@ -289,6 +325,7 @@ impl Field {
                         bias,
                         tile,
                         straight,
+                        jacobian,
                     })?
                     .labelled(label),
                 tangent: gpu
@@ -296,6 +333,7 @@ impl Field {
                         levels: grid_levels,
                         features,
                         coordinates,
+                        jacobian,
                         ..field_tangent::Shape::default()
                     })?
                     .labelled(label),
@@ -321,7 +359,7 @@ impl Field {
             hidden,
             heads,
             levels,
-            encoding: forward_part(1, 0, &format!("{label} encoding"))?,
+            encoding: forward_part(1, 0, &encoding)?,
             forward: Network {
                 kernel: match few_cores || by_matrices {
                     true => forward_part(2, 1, &network)?,
@@ -383,6 +421,25 @@ impl Field {
         32.0 * f64::from(self.shape.grid.outputs())
     }
 
+    fn keeping_jacobian(&self) -> Option<&Kernel<field_forward::Args>> {
+        self.by_chain_rule.as_ref()?.encoding.as_ref()
+    }
+
+    fn jacobian_bytes(&self) -> f64 {
+        12.0 * f64::from(self.shape.grid.outputs())
+    }
+
+    /// Operations and bytes of a product with ∂e/∂x: it is read, or looked up once more.
+    fn jacobian_work(&self) -> (f64, f64) {
+        match self.keeping_jacobian() {
+            Some(_) => (
+                6.0 * f64::from(self.shape.grid.outputs()),
+                self.jacobian_bytes(),
+            ),
+            None => (4.0 * self.interpolation_flops(), self.gather_bytes()),
+        }
+    }
+
     fn interpolation_flops(&self) -> f64 {
         16.0 * f64::from(self.shape.grid.outputs())
     }
@@ -425,11 +482,18 @@ impl Field {
     ) {
         let args = self.forward_args(params, points, buffers, PtrMut::NULL, 0..buffers.n);
         let levels = f64::from(self.shape.grid.levels);
+        let mut flops = self.interpolation_flops();
+        let mut bytes = self.gather_bytes() + self.row_bytes();
+        let keeping = buffers.slope.as_ref().and(self.keeping_jacobian());
+        if keeping.is_some() {
+            flops *= 4.0;
+            bytes += self.jacobian_bytes();
+        }
         let work = Work::items(u64::from(buffers.n))
             .slices(self.shape.grid.levels)
-            .flops(self.interpolation_flops() / levels)
-            .bytes((self.gather_bytes() + self.row_bytes()) / levels);
-        rec.run(&self.encoding, work, args);
+            .flops(flops / levels)
+            .bytes(bytes / levels);
+        rec.run(keeping.unwrap_or(&self.encoding), work, args);
     }
 
     fn forward_args(
@@ -451,6 +515,10 @@ impl Field {
             inputs: buffers.inputs.ptr_mut(),
             hidden: buffers.hidden.ptr_mut(),
             first,
+            jacobian: match &buffers.slope {
+                Some(slope) => slope.jacobian(),
+                None => PtrMut::NULL,
+            },
             n: buffers.n,
             n_hidden: buffers.n_hidden,
             begin: launch.start,
@@ -475,12 +543,14 @@ impl Field {
             head_weight: params.weight(self.heads, 0),
             points,
             inputs: buffers.inputs.ptr(),
+            jacobian: out.jacobian().read(),
             slopes: out.slopes.ptr_mut(),
             gradient: out.gradient.ptr_mut(),
             n,
         };
-        let flops = 2.0 * self.hidden_flops() + 4.0 * self.interpolation_flops();
-        let bytes = self.gather_bytes() + 4.0 * self.row_bytes();
+        let (flops, bytes) = self.jacobian_work();
+        let flops = 2.0 * self.hidden_flops() + flops;
+        let bytes = 2.0 * self.row_bytes() + bytes;
         let work = Work::items(u64::from(n)).flops(flops).bytes(bytes);
         rec.run(&self.kernels().gradient, work, args);
     }
@@ -523,6 +593,7 @@ impl Field {
             levels: self.levels.ptr(),
             table: pass.params.values().ptr().offset(self.table),
             points: pass.points,
+            jacobian: slope.jacobian().read(),
             d_gradient: slope.d_gradient.ptr(),
             tangents: pass.scratch.tangents.ptr_mut(),
             n: pass.buffers.n,
@@ -530,10 +601,11 @@ impl Field {
             end: pass.chunk.end,
         };
         let levels = f64::from(self.shape.grid.levels);
+        let (flops, bytes) = self.jacobian_work();
         let work = Work::items(pass.chunk.len() as u64)
             .slices(self.shape.grid.levels)
-            .flops(4.0 * self.interpolation_flops() / levels)
-            .bytes((self.gather_bytes() + self.row_bytes()) / levels);
+            .flops(flops / levels)
+            .bytes((bytes + self.row_bytes()) / levels);
         rec.run(&self.kernels().tangent, work, args);
     }
 

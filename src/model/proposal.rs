@@ -41,6 +41,7 @@ impl Proposal {
             coordinates: false,
             softplus: false,
             gradient: false,
+            jacobian: false,
         }
     }
 

@@ -74,6 +74,9 @@ pub struct ShadeInputs {
 
 const DIRECTION_ENCODING: u32 = 27;
 
+/// Bytes that the encoding's Jacobian at a batch of samples may take where it is kept.
+const MOST_JACOBIAN: u64 = 256 << 20;
+
 impl Surface {
     /// The field's shape in this configuration.
     pub fn field_shape(config: &Config) -> FieldShape {
@@ -91,6 +94,11 @@ impl Surface {
             coordinates: true,
             softplus: true,
             gradient: config.surface.gradient == GradientKind::Analytic,
+            jacobian: 12
+                * u64::from(grid.outputs())
+                * u64::from(config.rays)
+                * u64::from(config.sampling.samples)
+                <= MOST_JACOBIAN,
         }
     }
 

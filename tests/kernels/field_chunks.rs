@@ -1,5 +1,5 @@
 //! A field's backward pass over more points than it takes at once, and over points with heads and without, is the sum of passes over
-//! fewer; and straight-line code makes the same of a field as loops do.
+//! fewer; straight-line code makes the same of a field as loops do, and a kept Jacobian the same as one looked up.
 
 use crate::harness::assert_gradient;
 use neurodin::Result;
@@ -20,6 +20,7 @@ const SHAPE: FieldShape = FieldShape {
     coordinates: true,
     softplus: true,
     gradient: true,
+    jacobian: true,
 };
 const POINTS: usize = 70_001;
 /// Leading points with heads.
@@ -57,7 +58,7 @@ fn assert_valid(gpu: &Gpu) {
     assert!(messages.is_empty(), "{}", messages.join("\n"));
 }
 
-fn field(gpu: &Gpu) -> Result<(Field, Params)> {
+fn field(gpu: &Gpu, shape: FieldShape) -> Result<(Field, Params)> {
     let mut plan = ParamsPlan::default();
     let (hidden, inputs) = (SHAPE.hidden, SHAPE.inputs());
     let table = [SHAPE.grid.entries(), u64::from(SHAPE.grid.features)];
@@ -70,7 +71,7 @@ fn field(gpu: &Gpu) -> Result<(Field, Params)> {
     };
     let first = matrix("hidden", 2, hidden, inputs);
     let head = matrix("head", 3, 1, hidden);
-    let field = Field::new(gpu, "chunks", SHAPE, table, first, head)?;
+    let field = Field::new(gpu, "chunks", shape, table, first, head)?;
     Ok((field, plan.build(gpu, 1, true)?))
 }
 
@@ -83,8 +84,8 @@ fn backward(
     let n = range.len() as u32;
     let with_heads = range.start.min(WITH_HEADS)..range.end.min(WITH_HEADS);
     let n_hidden = with_heads.len() as u32;
-    let buffers = FieldBuffers::new(gpu, "chunks", &SHAPE, n, n_hidden)?;
-    let scratch = Scratch::new(gpu, &[(SHAPE, n)])?;
+    let buffers = FieldBuffers::new(gpu, "chunks", &field.shape, n, n_hidden)?;
+    let scratch = Scratch::new(gpu, &[(field.shape, n)])?;
     let filled = |name: &str, values: &[f32]| {
         let buffer = gpu.buffer(name, values.len() as u64)?;
         gpu.upload(&buffer, 0, values).map(|()| buffer)
@@ -143,7 +144,7 @@ fn assert_gradients(params: &Params, got: &[f64], want: &[f64]) {
 #[test]
 fn many_points_are_the_sum_of_fewer() -> Result<()> {
     let gpu = &open(&[])?;
-    let (whole, parts) = (field(gpu)?, field(gpu)?);
+    let (whole, parts) = (field(gpu, SHAPE)?, field(gpu, SHAPE)?);
     let d_points = backward(gpu, &whole, 0..POINTS)?;
     let cut = 40_000;
     let of_parts = [
@@ -166,6 +167,25 @@ fn many_points_are_the_sum_of_fewer() -> Result<()> {
 }
 
 #[test]
+fn a_jacobian_that_is_kept_is_the_one_looked_up() -> Result<()> {
+    let gpu = &open(&[])?;
+    let looked_up = FieldShape {
+        jacobian: false,
+        ..SHAPE
+    };
+    let (kept, looked_up) = (field(gpu, SHAPE)?, field(gpu, looked_up)?);
+    // Both halves of a pass that is cut.
+    let range = 1..POINTS;
+    let got = backward(gpu, &kept, range.clone())?;
+    let want = backward(gpu, &looked_up, range)?;
+    assert_gradient("what the points hear", &wide(&got), &wide(&want));
+    let want = gradients(gpu, &looked_up.1)?;
+    assert_gradients(&kept.1, &gradients(gpu, &kept.1)?, &want);
+    assert_valid(gpu);
+    Ok(())
+}
+
+#[test]
 fn straight_line_code_is_the_same_field() -> Result<()> {
     let loops = &open(&[])?;
     let ways = layer_ways(loops, SHAPE.hidden).into_iter();
@@ -177,7 +197,7 @@ fn straight_line_code_is_the_same_field() -> Result<()> {
     let straight = &open(&ways)?;
     // Points with heads and without, of both a number that leaves a workgroup's last invocations without work.
     let range = WITH_HEADS - 501..WITH_HEADS + 407;
-    let (of_loops, of_straight) = (field(loops)?, field(straight)?);
+    let (of_loops, of_straight) = (field(loops, SHAPE)?, field(straight, SHAPE)?);
     let want = backward(loops, &of_loops, range.clone())?;
     let got = backward(straight, &of_straight, range)?;
     assert_gradient("what the points hear", &wide(&got), &wide(&want));
