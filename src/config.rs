@@ -185,6 +185,8 @@ pub struct SurfaceConfig {
     pub features: u32,
     /// Mirrors the geometric initialisation: free space inside the initial sphere (indoor scenes).
     pub inside_out: bool,
+    /// Deviation of the hidden layer's first weights on hash features, as a share of those on the position.
+    pub init_hash: f64,
     /// Radius-like bias of the geometric initialisation.
     pub init_bias: f64,
     /// What hides what lies behind.
@@ -340,6 +342,8 @@ pub enum BackgroundKind {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LossConfig {
+    /// Weight of the squared colour error beside the absolute one, whose weight is 1.
+    pub color_squared: f64,
     pub eikonal: f64,
     pub interlevel: f64,
     /// Tangent-normal consistency (Rosu and Behnke 2023, PermutoSDF); needs the analytic gradient.

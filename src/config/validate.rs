@@ -38,6 +38,7 @@ impl Config {
         wrong.whole("hash.release.every", hash.release.every, 1, 100_000_000);
         wrong.network("surface.hidden", self.surface.hidden);
         wrong.whole("surface.features", self.surface.features, 1, 256);
+        wrong.real("surface.init_hash", self.surface.init_hash, 0.0, 10.0);
         wrong.real("surface.init_bias", self.surface.init_bias, 0.0, 10.0);
         wrong.real("surface.scale_max", self.surface.scale_max, 1e-4, 10.0);
         wrong.real("surface.scale_floor", self.surface.scale_floor, 1e-6, 1.0);
@@ -126,6 +127,7 @@ impl Config {
         }
 
         let loss = &self.loss;
+        wrong.real("loss.color_squared", loss.color_squared, 0.0, 1e3);
         wrong.real("loss.eikonal", loss.eikonal, 0.0, 1e3);
         wrong.real("loss.interlevel", loss.interlevel, 0.0, 1e3);
         wrong.real("loss.mask", loss.mask, 0.0, 1e3);

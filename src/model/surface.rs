@@ -108,16 +108,20 @@ impl Surface {
         let (hidden, inputs) = (shape.hidden, shape.inputs());
         let geometry = config.surface.features;
 
-        // Hidden layer: xyz columns N(0, √2/√hidden), hash columns 0. Heads: all rows N(±√π/√hidden, 1e-4), bias ∓init_bias, so that
-        // f ≈ ‖x‖ − r; mirrored where free space is inside.
+        // Hidden layer: xyz columns N(0, √2/√hidden), hash columns 0 (published) or a share of that. Heads: all rows N(±√π/√hidden, 1e-4),
+        // bias ∓init_bias, so that f ≈ ‖x‖ − r; mirrored where free space is inside.
         let mut draws = Draws::new(config.seed, "surface");
         let deviation = (2.0 / f64::from(hidden)).sqrt();
         let v = (0..hidden * inputs)
             .map(|i| {
-                if i % inputs < 3 {
-                    draws.normal(0.0, deviation)
+                let share = if i % inputs < 3 {
+                    1.0
                 } else {
-                    0.0
+                    config.surface.init_hash
+                };
+                match share > 0.0 {
+                    true => draws.normal(0.0, share * deviation),
+                    false => 0.0,
                 }
             })
             .collect();

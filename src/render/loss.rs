@@ -46,6 +46,8 @@ pub struct Loss {
     d_query_sdf: Buffer<f32>, // [2, n_rays]
     pub tangent: Option<Tangent>,
     pub supervision: Option<Supervision>,
+    /// Weight of the squared colour error.
+    squared: f32,
     /// What the gradients of a sample's eikonal and of a ray's interlevel losses are to be multiplied by, as their sums are.
     pub eikonal_scale: f32,
     pub interlevel_scale: f32,
@@ -95,6 +97,7 @@ impl Loss {
             d_query_sdf: gpu.scratch("bias d_sdf", 2 * n)?,
             tangent: Tangent::new(gpu, config, n_rays * n_samples)?,
             supervision: Supervision::new(gpu, config, n_rays, priors)?,
+            squared: config.loss.color_squared as f32,
             eikonal_scale: config.loss.eikonal as f32 / (n_rays * n_samples) as f32,
             interlevel_scale: config.loss.interlevel as f32 / n_rays as f32,
             terms: gpu.buffer("loss terms", TERMS.len() as u64)?,
@@ -123,6 +126,7 @@ impl Loss {
             d_color: self.d_color.ptr_mut(),
             n_rays: self.n_rays,
             scale: 1.0 / self.n_rays as f32,
+            squared: self.squared,
         };
         rec.run(
             &self.color_loss,

@@ -621,6 +621,7 @@ fn whole_step_of_stage_1() {
             d_color: d_color.ptr_mut(),
             n_rays: n as u32,
             scale: 1.0 / n as f32,
+            squared: 0.0,
         },
     );
     let loss = device.take(&loss).iter().sum::<f64>() / n as f64;

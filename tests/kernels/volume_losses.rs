@@ -29,12 +29,16 @@ fn colour_loss() {
             d_color: d_color.ptr_mut(),
             n_rays: n as u32,
             scale: 0.5 / n as f32,
+            squared: 3.0,
         },
     );
     let error = |ray: usize, c: usize| image[c * n + ray] - target[c * n + ray];
     let weight = |ray: usize| target[3 * n + ray];
     let want: Vec<f64> = (0..n)
-        .map(|ray| weight(ray) * (0..3).map(|c| error(ray, c).abs()).sum::<f64>() / 3.0)
+        .map(|ray| {
+            let errors = (0..3).map(|c| error(ray, c));
+            weight(ray) * errors.map(|e| e.abs() + 3.0 * e * e).sum::<f64>() / 3.0
+        })
         .collect();
     assert_forward("loss", &device.take(&loss), &want);
     let want: Vec<f64> = (0..n)
@@ -46,7 +50,7 @@ fn colour_loss() {
         if error == 0.0 {
             0.0
         } else {
-            0.5 / n as f64 * weight(ray) * error.signum() / 3.0
+            0.5 / n as f64 * weight(ray) * (error.signum() + 6.0 * error) / 3.0
         }
     };
     let want: Vec<f64> = (0..3)

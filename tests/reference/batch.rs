@@ -102,6 +102,7 @@ pub struct StepConfig {
     /// Length of a view's appearance code; 0: none.
     pub appearance: usize,
     pub background: Background,
+    pub color_squared: f64,
     pub eikonal_weight: f64,
     pub interlevel_weight: f64,
     pub bias_epsilon: f64,

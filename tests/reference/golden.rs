@@ -105,6 +105,7 @@ pub fn whole_step(npz: &Npz) -> Step {
         views: 0,
         appearance: 0,
         background: Background::Fixed([background[0], background[1], background[2]]),
+        color_squared: 0.0,
         eikonal_weight: 0.01,
         interlevel_weight: 1.0,
         bias_epsilon: 5e-4,

@@ -4,15 +4,21 @@ use super::sampling::dot;
 use super::tape::{Tape, Var};
 use std::f64::consts::PI;
 
-/// Per ray: weight · mean over the channels of |C − target|, for C `[n, 3]` and targets (r, g, b, weight). `[n, 1]`.
-pub fn color(tape: &mut Tape, rendered: Var, target: &[[f64; 4]]) -> Var {
+/// Per ray: weight · mean over the channels of |e| + squared · e², e = C − target, for C `[n, 3]` and targets (r, g, b, weight). `[n, 1]`.
+pub fn color(tape: &mut Tape, rendered: Var, target: &[[f64; 4]], squared: f64) -> Var {
     assert_eq!(rendered.rows, target.len());
     let target = target.to_vec();
     let value = target
         .iter()
         .zip(tape.value(rendered).chunks_exact(3))
         .map(|(&[r, g, b, weight], c)| {
-            weight * ((c[0] - r).abs() + (c[1] - g).abs() + (c[2] - b).abs()) / 3.0
+            let errors = [c[0] - r, c[1] - g, c[2] - b];
+            weight
+                * errors
+                    .map(|e| e.abs() + squared * e * e)
+                    .iter()
+                    .sum::<f64>()
+                / 3.0
         })
         .collect();
     tape.record(
@@ -29,7 +35,8 @@ pub fn color(tape: &mut Tape, rendered: Var, target: &[[f64; 4]]) -> Var {
                     let error = tape.value(rendered)[ray * 3 + channel] - target[channel];
                     if error != 0.0 {
                         d_rendered[ray * 3 + channel] +=
-                            d_loss[ray] * target[3] * error.signum() / 3.0;
+                            d_loss[ray] * target[3] * (error.signum() + 2.0 * squared * error)
+                                / 3.0;
                     }
                 }
             }

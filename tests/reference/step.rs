@@ -135,7 +135,7 @@ impl Step {
         self.integrate(tape.value(weights), tape.value(gradient), &mut images);
 
         // Losses.
-        let color_error = losses::color(tape, image, &rays.target);
+        let color_error = losses::color(tape, image, &rays.target, config.color_squared);
         let color = tape.sum(color_error);
         let color = tape.scale(color, now.inv_count);
         let eikonal = losses::eikonal(tape, gradient);

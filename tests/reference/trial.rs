@@ -68,6 +68,7 @@ pub fn config() -> StepConfig {
         views: 3,
         appearance: 4,
         background: Background::Learned,
+        color_squared: 3.0,
         eikonal_weight: 0.01,
         interlevel_weight: 1.0,
         bias_epsilon: 5e-4,

@@ -467,6 +467,7 @@ fn twin_config(config: &Config, shape: &RegionShape, views: u32) -> StepConfig {
                 contraction: background.contraction,
             }),
         },
+        color_squared: config.loss.color_squared,
         eikonal_weight: config.loss.eikonal,
         interlevel_weight: config.loss.interlevel,
         bias_epsilon: bias.epsilon,
