@@ -187,6 +187,8 @@ pub struct SurfaceConfig {
     pub inside_out: bool,
     /// Deviation of the hidden layer's first weights on hash features, as a share of those on the position.
     pub init_hash: f64,
+    /// Deviation of the features' first weights from those of the signed distance, as a share of these.
+    pub init_features: f64,
     /// Radius-like bias of the geometric initialisation.
     pub init_bias: f64,
     /// What hides what lies behind.
@@ -271,6 +273,8 @@ pub struct ColorConfig {
     pub hidden: u32,
     /// Hidden layers.
     pub layers: u32,
+    /// Of the first weights, which are U(±1/√inputs) times this.
+    pub init_gain: f64,
 }
 
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

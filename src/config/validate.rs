@@ -39,6 +39,12 @@ impl Config {
         wrong.network("surface.hidden", self.surface.hidden);
         wrong.whole("surface.features", self.surface.features, 1, 256);
         wrong.real("surface.init_hash", self.surface.init_hash, 0.0, 10.0);
+        wrong.real(
+            "surface.init_features",
+            self.surface.init_features,
+            0.0,
+            10.0,
+        );
         wrong.real("surface.init_bias", self.surface.init_bias, 0.0, 10.0);
         wrong.real("surface.scale_max", self.surface.scale_max, 1e-4, 10.0);
         wrong.real("surface.scale_floor", self.surface.scale_floor, 1e-6, 1.0);
@@ -85,6 +91,7 @@ impl Config {
         }
         wrong.network("color.hidden", self.color.hidden);
         wrong.whole("color.layers", self.color.layers, 1, 8);
+        wrong.real("color.init_gain", self.color.init_gain, 0.01, 10.0);
         wrong.whole("appearance.dims", self.appearance.dims, 0, 64);
 
         let sampling = &self.sampling;

@@ -109,7 +109,7 @@ impl Surface {
         let geometry = config.surface.features;
 
         // Hidden layer: xyz columns N(0, √2/√hidden), hash columns 0 (published) or a share of that. Heads: all rows N(±√π/√hidden, 1e-4),
-        // bias ∓init_bias, so that f ≈ ‖x‖ − r; mirrored where free space is inside.
+        // bias ∓init_bias, so that f ≈ ‖x‖ − r; mirrored where free space is inside. Rows of features may begin farther apart.
         let mut draws = Draws::new(config.seed, "surface");
         let deviation = (2.0 / f64::from(hidden)).sqrt();
         let v = (0..hidden * inputs)
@@ -137,7 +137,13 @@ impl Surface {
         let mean = sign * (std::f64::consts::PI / f64::from(hidden)).sqrt();
         let rows = 2 + geometry;
         let v = (0..rows * hidden)
-            .map(|_| draws.normal(mean, 1e-4))
+            .map(|i| {
+                let share = match i / hidden < 2 {
+                    true => 0.0,
+                    false => config.surface.init_features,
+                };
+                draws.normal(mean, 1e-4 + share * mean.abs())
+            })
             .collect();
         let bias = vec![(-sign * config.surface.init_bias) as f32; rows as usize];
         let heads_weight = plan.add_normalised(
@@ -167,9 +173,11 @@ impl Surface {
         for (layer, pair) in widths.windows(2).enumerate() {
             let (n_in, n_out) = (pair[0], pair[1]);
             let last = layer + 2 == widths.len();
-            // PyTorch's default: weights and bias U(±1/√fan_in).
+            // PyTorch's default: weights and bias U(±1/√fan_in), but for the gain.
             let bound = 1.0 / f64::from(n_in).sqrt();
-            let v = (0..n_in * n_out).map(|_| draws.symmetric(bound)).collect();
+            let v = (0..n_in * n_out)
+                .map(|_| draws.symmetric(config.color.init_gain * bound))
+                .collect();
             let bias = (0..n_out).map(|_| draws.symmetric(bound)).collect();
             let name = format!("color.{layer}");
             let handle = plan.add_normalised(Group::Fields, &name, u64::from(n_in), v, bias, false);

@@ -1,6 +1,7 @@
 //! Every kernel against a slow twin in float64, and against arrays of the published implementation.
 
 mod field_chunks;
+mod first_weights;
 mod harness;
 mod layer;
 mod lazy_table;
