@@ -40,6 +40,7 @@ fn check(npz: &Npz, mut config: Config, stage: Stage) -> Result<()> {
     let published = golden::whole_step(npz);
     config.rays = published.rays.origins.len() as u32;
     config.loss.bias.reduction = BiasReduction::Published;
+    config.loss.color_squared = 0.0; // as published
     let rig = Rig::new(config, RegionShape::Sphere, GpuOptions::default())?;
     assert_eq!(rig.twin.samples, published.config.samples);
     assert_eq!(rig.twin.proposal_samples, published.config.proposal_samples);
