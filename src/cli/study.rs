@@ -132,7 +132,7 @@ impl Planned<'_> {
         }
         let path = run.config();
         let text = fs::read_to_string(&path).map_err(|e| Error::unreadable(&path, &e))?;
-        let was = Config::from_toml(&text, &path.display().to_string())?;
+        let was = Config::recorded(&text, &path.display().to_string())?;
         // A run that went on with its second stage holds the settings of that.
         let second = (was.first_step > 0).then(|| self.config.second_stage());
         let now = second.flatten().unwrap_or_else(|| self.config.clone());

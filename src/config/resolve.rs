@@ -197,6 +197,17 @@ impl Config {
         Config::from_toml_or(text, source, Config::default())?.validated()
     }
 
+    /// The configuration that a run recorded with [`Config::to_toml`]: nothing comes from the preset that it began with, which may
+    /// have changed since. A setting that the text lacks is younger than it, and has the value that outdoor-large.toml gives it: new
+    /// settings have there what was done before them.
+    ///
+    /// # Errors
+    /// As [`Config::from_toml`].
+    pub fn recorded(text: &str, source: &str) -> Result<Config> {
+        let complete = Table::try_from(Config::default()).expect("a configuration is a table");
+        overlay(complete, &parse(text, source)?, source)?.validated()
+    }
+
     /// As [`Config::from_toml`], but a text without the key `preset` differs from `base`; ranges are not checked yet.
     ///
     /// # Errors
@@ -259,7 +270,8 @@ impl Config {
         check(table, key, text)
     }
 
-    /// Every setting as TOML, each with the comment that explains it. [`Config::from_toml`] reads it back to an equal configuration.
+    /// Every setting as TOML, each with the comment that explains it. [`Config::recorded`] and [`Config::from_toml`] read it back to an
+    /// equal configuration.
     pub fn to_toml(&self) -> String {
         let table = Table::try_from(self).expect("a configuration is a table");
         let mut text = String::new();
@@ -452,7 +464,27 @@ mod tests {
             let text = config.to_toml();
             assert!(text.contains("# of every random number"), "comments stay");
             assert_eq!(Config::from_toml(&text, "text").unwrap(), config);
+            assert_eq!(Config::recorded(&text, "text").unwrap(), config);
         }
+    }
+
+    #[test]
+    fn a_recorded_run_lacks_what_came_after_it() {
+        let tiny = Config::preset("outdoor-tiny").unwrap();
+        assert!(tiny.loss.color_squared > 0.0, "else this tests nothing");
+        let older: String = tiny
+            .to_toml()
+            .lines()
+            .filter(|line| !line.starts_with("color_squared"))
+            .map(|line| format!("{line}\n"))
+            .collect();
+        let run = Config::recorded(&older, "config.toml").unwrap();
+        let differences = tiny.differences(&run);
+        let keys: Vec<&str> = differences.iter().map(|d| d.key.as_str()).collect();
+        assert_eq!(keys, ["loss.color_squared"]);
+        assert_eq!(run.loss.color_squared, 0.0);
+        let told = complaint(Config::recorded("rays = 'many'", "config.toml"));
+        assert!(told.contains("config.toml"), "{told}");
     }
 
     #[test]
@@ -473,6 +505,7 @@ mod tests {
                 }
                 let text = config.to_toml();
                 assert_eq!(Config::from_toml(&text, "text").unwrap(), config);
+                assert_eq!(Config::recorded(&text, "text").unwrap(), config);
             }
         }
         let partial = "preset = 'outdoor-tiny'\nmethod = 'neus-grid'\nrays = 8\n";

@@ -312,7 +312,7 @@ fn read_state(metadata: &HashMap<String, String>) -> Result<State, Refusal> {
         step: text("step")?
             .parse()
             .map_err(|error| unreadable("step", &error))?,
-        config: Config::from_toml(text("config")?, "its configuration")
+        config: Config::recorded(text("config")?, "its configuration")
             .map_err(|error| unreadable("configuration", &error))?,
         region: serde_json::from_str(text("region")?)
             .map_err(|error| unreadable("region", &error))?,
