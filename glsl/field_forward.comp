@@ -12,7 +12,7 @@
 layout(constant_id = 7) const uint HEADS = 1;
 layout(constant_id = 8) const uint PART = 0;      // 0 everything, 1 the encoding of one level per slice, 2 the network
 layout(constant_id = 9) const uint STRAIGHT = 0;
-layout(constant_id = 10) const uint JACOBIAN = 0; // PART 1 keeps ∂e/∂x, for the gradient
+layout(constant_id = 10) const uint KEPT = 0;     // order up to which PART 1 keeps the encoding's derivatives: 0, 1 or 2
 #include "lib/tile.glsl"
 
 layout(push_constant, scalar) uniform Args {
@@ -26,12 +26,17 @@ layout(push_constant, scalar) uniform Args {
     F32sMut inputs;      // [INPUTS, n] z, kept for the backward pass
     F32sMut hidden;      // [HIDDEN, n_hidden] h of the first n_hidden points, for further heads
     F32sMut first;       // [n] out
-    F32sMut jacobian;    // [3, LEVELS·FEATURES, n] ∂e/∂x, where JACOBIAN
+    F32sMut derivatives; // [3 KEPT, LEVELS·FEATURES, n] of the encoding
     uint n;
     uint n_hidden;
     uint begin;          // the points of this launch
     uint end;
 };
+
+// Three derivatives of a feature, from a row on.
+void keep(vec3 d, uint row, uint feature, uint point) {
+    [[unroll]] for (uint i = 0u; i < 3u; ++i) derivatives.at[derivative_row(row + i, feature) * n + point] = d[i];
+}
 
 void main() {
     // In straight-line code, invocations past the end do the last point once more, and write what its own invocation writes.
@@ -55,9 +60,8 @@ void main() {
                 [[unroll]] for (uint f = 2u * k; f < min(2u * k + 2u, FEATURES); ++f) {
                     uint feature = l * FEATURES + f;
                     inputs.at[(COORDINATES + feature) * n + point] = e.value[f % 2u];
-                    if (JACOBIAN == 0u) continue;
-                    vec3 slope = slope_of(level, e, f % 2u);
-                    [[unroll]] for (uint axis = 0u; axis < 3u; ++axis) jacobian.at[jacobian_row(axis, feature) * n + point] = slope[axis];
+                    if (KEPT >= 1u) keep(slope_of(level, e, f % 2u), 0u, feature, point);
+                    if (KEPT >= 2u) keep(mixed_of(level, e, f % 2u), 3u, feature, point);
                 }
             }
         }

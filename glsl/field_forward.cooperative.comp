@@ -24,7 +24,7 @@ layout(push_constant, scalar) uniform Args {
     F32sMut inputs;      // [INPUTS, n] z, kept for the backward pass
     F32sMut hidden;      // [HIDDEN, n_hidden] h of the first n_hidden points, for further heads
     F32sMut first;       // [n] out
-    F32sMut jacobian;    // PART 1 alone
+    F32sMut derivatives; // PART 1 alone
     uint n;
     uint n_hidden;
     uint begin;          // the points of this launch

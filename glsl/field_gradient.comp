@@ -7,7 +7,7 @@
 #include "lib/field.glsl"
 
 layout(constant_id = 7) const uint STRAIGHT = 0;
-layout(constant_id = 8) const uint JACOBIAN = 0; // 1: field_forward has kept ∂e/∂x; 0: the table is looked up once more
+layout(constant_id = 8) const uint KEPT = 0;  // 1: field_forward has kept ∂e/∂x; 0: the table is looked up once more
 #include "lib/tile.glsl"
 
 layout(push_constant, scalar) uniform Args {
@@ -18,7 +18,7 @@ layout(push_constant, scalar) uniform Args {
     F32s head_weight;    // [HIDDEN]
     F32s points;         // [3, n] region frame
     F32s inputs;         // [INPUTS, n] z, as field_forward left them
-    F32s jacobian;       // [3, LEVELS·FEATURES, n] ∂e/∂x, where JACOBIAN
+    F32s derivatives;    // [3, LEVELS·FEATURES, n] ∂e/∂x, where KEPT
     F32sMut slopes;      // [INPUTS, n] a
     F32sMut gradient;    // [3, n] g, per region unit
     uint n;
@@ -46,10 +46,10 @@ void main() {
     [[unroll]] for (uint i = 0u; i < INPUTS; ++i) slopes.at[i * n + point] = a[i];
 
     vec3 g = COORDINATES != 0u ? vector_at(reading(slopes), point, n) : vec3(0.0);
-    if (JACOBIAN != 0u) {
+    if (KEPT != 0u) {
         [[unroll]] for (uint feature = 0u; feature < LEVELS * FEATURES; ++feature) {
             [[unroll]] for (uint axis = 0u; axis < 3u; ++axis) {
-                g[axis] = fma(a[COORDINATES + feature], jacobian.at[jacobian_row(axis, feature) * n + point], g[axis]);
+                g[axis] = fma(a[COORDINATES + feature], derivatives.at[derivative_row(axis, feature) * n + point], g[axis]);
             }
         }
         set_vector(gradient, point, n, g);

@@ -6,11 +6,14 @@
 #include "lib/hash_grid.glsl"
 #include "lib/field.glsl"
 
+layout(constant_id = 7) const uint KEPT = 0; // 2: field_forward has kept the encoding's derivatives; 0: the table is looked up once more
+
 layout(push_constant, scalar) uniform Args {
     Levels levels;
     F32s table;       // [entries, FEATURES]
     F32s points;      // [3, n]
     F32s d_inputs;    // [INPUTS, end - begin] d_z
+    F32s derivatives; // [6, LEVELS·FEATURES, n] ∂e/∂x and ∂²e/∂x², where KEPT
     F32s slopes;      // [INPUTS, n] a
     F32s d_gradient;  // [3, n] v
     F32sMut d_points; // [3, n]
@@ -26,6 +29,14 @@ void main() {
     vec3 v = vector_at(d_gradient, point, n);
     vec3 d_x = COORDINATES != 0u ? vector_at(d_inputs, item(), count) : vec3(0.0);
     for (uint l = 0u; l < LEVELS; ++l) {
+        if (KEPT != 0u) {
+            [[unroll]] for (uint f = 0u; f < FEATURES; ++f) {
+                uint feature = l * FEATURES + f, row = COORDINATES + feature;
+                vec3 slope = kept_derivatives(derivatives, 0u, feature, point, n), mixed = kept_derivatives(derivatives, 3u, feature, point, n);
+                d_x += d_inputs.at[row * count + item()] * slope + slopes.at[row * n + point] * curvature_along(mixed, v);
+            }
+            continue;
+        }
         Level level = levels.at[l];
         Cell cell = cell_of(level, x);
         vec2 d_e[PAIRS], slope[PAIRS];
@@ -45,7 +56,7 @@ void main() {
             }
         }
         Interpolation e = interpolate(corners, cell.weight);
-        d_x += slope_of(level, e, 0u) + curvature_along(level, e, 1u, v);
+        d_x += slope_of(level, e, 0u) + curvature_along(mixed_of(level, e, 1u), v);
     }
     set_vector(d_points, point, n, d_x);
 }

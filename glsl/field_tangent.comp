@@ -5,13 +5,13 @@
 #include "lib/hash_grid.glsl"
 #include "lib/field.glsl"
 
-layout(constant_id = 7) const uint JACOBIAN = 0; // 1: field_forward has kept ∂e/∂x; 0: the table is looked up once more
+layout(constant_id = 7) const uint KEPT = 0; // 1: field_forward has kept ∂e/∂x; 0: the table is looked up once more
 
 layout(push_constant, scalar) uniform Args {
     Levels levels;
     F32s table;       // [entries, FEATURES]
     F32s points;      // [3, n]
-    F32s jacobian;    // [3, LEVELS·FEATURES, n] ∂e/∂x, where JACOBIAN
+    F32s derivatives; // [3, LEVELS·FEATURES, n] ∂e/∂x, where KEPT
     F32s d_gradient;  // [3, n] v
     F32sMut tangents; // [INPUTS, end - begin] ȧ
     uint n;
@@ -25,11 +25,10 @@ void main() {
     vec3 v = vector_at(d_gradient, point, n);
     uint l = level_of_slice(LEVELS);
     if (COORDINATES != 0u && l == 0u) set_vector(tangents, item(), count, v);
-    if (JACOBIAN != 0u) {
+    if (KEPT != 0u) {
         [[unroll]] for (uint f = 0u; f < FEATURES; ++f) {
             uint feature = l * FEATURES + f;
-            vec3 slope;
-            [[unroll]] for (uint axis = 0u; axis < 3u; ++axis) slope[axis] = jacobian.at[jacobian_row(axis, feature) * n + point];
+            vec3 slope = kept_derivatives(derivatives, 0u, feature, point, n);
             tangents.at[(COORDINATES + feature) * count + item()] = dot(slope, v);
         }
         return;

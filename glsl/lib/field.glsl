@@ -12,8 +12,16 @@ layout(constant_id = 6) const uint TILE = 8;         // hidden neurons per pass 
 
 const uint INPUTS = COORDINATES + LEVELS * FEATURES;
 
-// Row of ∂e/∂x, kept as [3, LEVELS·FEATURES, n].
-uint jacobian_row(uint axis, uint feature) { return axis * LEVELS * FEATURES + feature; }
+// Row of the encoding's derivatives, where they are kept as [3 or 6, LEVELS·FEATURES, n]: 0 to 2 is ∂e/∂x by axis, 3 to 5 the mixed ones of
+// second order, along y and z, x and z, x and y.
+uint derivative_row(uint which, uint feature) { return which * LEVELS * FEATURES + feature; }
+
+// Three of a feature's, from a row on.
+vec3 kept_derivatives(F32s derivatives, uint row, uint feature, uint point, uint n) {
+    vec3 d;
+    [[unroll]] for (uint i = 0u; i < 3u; ++i) d[i] = derivatives.at[derivative_row(row + i, feature) * n + point];
+    return d;
+}
 
 // log(1 + e^{100u})/100 without overflow; equal to the published form, which turns linear above 100u = 20, to 2e-11.
 float softplus(float u) { return max(u, 0.0) + 0.01 * log(1.0 + exp(-100.0 * abs(u))); }

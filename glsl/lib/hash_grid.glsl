@@ -111,11 +111,13 @@ Interpolation interpolate(vec2 corners[8], vec3 w) {
 // One quantity's derivative by x in [-1, 1]³.
 vec3 slope_of(Level level, Interpolation e, uint f) { return 0.5 * level.scale * vec3(e.slope[0][f], e.slope[1][f], e.slope[2][f]); }
 
-// Its second derivative by x, times v.
-vec3 curvature_along(Level level, Interpolation e, uint f, vec3 v) {
-    vec3 mixed = vec3(e.mixed[0][f], e.mixed[1][f], e.mixed[2][f]);
-    return 0.25 * level.scale * level.scale * (mixed.zxy * v.yzx + mixed.yzx * v.zxy);
+// Its mixed second derivatives by x, in the order of Interpolation.
+vec3 mixed_of(Level level, Interpolation e, uint f) {
+    return 0.25 * level.scale * level.scale * vec3(e.mixed[0][f], e.mixed[1][f], e.mixed[2][f]);
 }
+
+// The second derivative with these mixed parts, times v.
+vec3 curvature_along(vec3 mixed, vec3 v) { return mixed.zxy * v.yzx + mixed.yzx * v.zxy; }
 
 // Whether two corners of a cell may share an entry. A corner's hash differs from corner 0's by the exclusive or of what its steps along
 // x, y and z change; those three numbers are odd, since the primes are, so corners meet only where two of the three are equal. In a

@@ -55,7 +55,7 @@ impl Background {
             coordinates: false,
             softplus: false,
             gradient: false,
-            jacobian: false,
+            kept: 0,
         })
     }
 

@@ -26,8 +26,9 @@ pub struct FieldShape {
     pub softplus: bool,
     /// The first output's gradient with respect to position is asked for, and learned from.
     pub gradient: bool,
-    /// For it, devices with few cores may keep the encoding's Jacobian of every point: half of the look-ups, for 12 bytes a feature and point.
-    pub jacobian: bool,
+    /// Order up to which devices with few cores keep the encoding's derivatives of every point, for 12 bytes a feature, point and order, in
+    /// place of looking them up again: 0; 1, all that the gradient needs; 2, those that the points' own gradients need as well.
+    pub kept: u32,
 }
 
 impl FieldShape {
@@ -48,9 +49,12 @@ impl FieldShape {
         }
     }
 
-    /// Whether [`field_forward`] keeps ∂e/∂x for the kernels of the gradient, which else look the table up again.
-    fn keeps_jacobian(&self, gpu: &Gpu) -> bool {
-        self.gradient && self.jacobian && gpu.info().few_cores
+    /// Order up to which [`field_forward`] keeps the encoding's derivatives for the kernels of the gradient on this device.
+    fn kept_on(&self, gpu: &Gpu) -> u32 {
+        match self.gradient && gpu.info().few_cores {
+            true => self.kept,
+            false => 0,
+        }
     }
 
     /// Rows that only fields with a gradient need.
@@ -83,8 +87,10 @@ pub struct Field {
 
 /// Kernels of the first output's gradient g = Jᵀ a.
 struct GradientKernels {
-    /// The encoding that keeps its Jacobian, where the others read it.
+    /// The encoding that keeps its derivatives, where the others read them.
     encoding: Option<Kernel<field_forward::Args>>,
+    /// Order up to which it does.
+    kept: u32,
     gradient: Kernel<field_gradient::Args>,
     tangent: Kernel<field_tangent::Args>,
     points: Kernel<field_point_backward::Args>,
@@ -132,15 +138,16 @@ pub struct FieldBuffers {
 
 /// The gradient of a field's first output, and what its backward pass reads.
 pub struct Slope {
-    pub gradient: Buffer<f32>,     // [3, n] g, per region unit
-    pub d_gradient: Buffer<f32>,   // [3, n]
-    slopes: Buffer<f32>,           // [inputs, n] a
-    jacobian: Option<Buffer<f32>>, // [3, hash features, n] ∂e/∂x, where it is kept
+    pub gradient: Buffer<f32>,        // [3, n] g, per region unit
+    pub d_gradient: Buffer<f32>,      // [3, n]
+    slopes: Buffer<f32>,              // [inputs, n] a
+    derivatives: Option<Buffer<f32>>, // [3 · order, hash features, n] of the encoding, where they are kept
 }
 
 impl Slope {
-    fn jacobian(&self) -> PtrMut<f32> {
-        self.jacobian.as_ref().map_or(PtrMut::NULL, Buffer::ptr_mut)
+    fn derivatives(&self) -> PtrMut<f32> {
+        let kept = self.derivatives.as_ref();
+        kept.map_or(PtrMut::NULL, Buffer::ptr_mut)
     }
 }
 
@@ -159,9 +166,9 @@ impl FieldBuffers {
                 gradient: planes("gradient", 3)?,
                 d_gradient: planes("d_gradient", 3)?,
                 slopes: planes("slopes", shape.inputs())?,
-                jacobian: match shape.keeps_jacobian(gpu) {
-                    true => Some(planes("jacobian", 3 * shape.grid.outputs())?),
-                    false => None,
+                derivatives: match shape.kept_on(gpu) {
+                    0 => None,
+                    order => Some(planes("derivatives", 3 * order * shape.grid.outputs())?),
                 },
             }),
             false => None,
@@ -235,8 +242,7 @@ impl Field {
         let (grid_levels, features) = (shape.grid.levels, shape.grid.features);
         let coordinates = shape.coordinate_inputs();
         let second_order = u32::from(shape.gradient);
-        let keeps_jacobian = shape.keeps_jacobian(gpu);
-        let jacobian = u32::from(keeps_jacobian);
+        let kept = shape.kept_on(gpu);
         let softplus = u32::from(shape.softplus);
         let bias = u32::from(hidden.bias.is_some());
         let tile = shape.hidden.min(8);
@@ -257,7 +263,7 @@ impl Field {
             heads: 1,
             part: 0,
             straight,
-            jacobian: 0,
+            kept: 0,
         };
         let backward = field_backward::Shape {
             levels: grid_levels,
@@ -303,18 +309,19 @@ impl Field {
         let network = format!("{label} network");
         let by_chain_rule = match shape.gradient {
             true => Some(GradientKernels {
-                encoding: match keeps_jacobian {
-                    true => {
+                encoding: match kept {
+                    0 => None,
+                    _ => {
                         let shape = field_forward::Shape {
                             part: 1,
                             heads: 0,
-                            jacobian,
+                            kept,
                             ..forward
                         };
                         Some(gpu.kernel(shape)?.labelled(&encoding))
                     }
-                    false => None,
                 },
+                kept,
                 gradient: gpu
                     .kernel(field_gradient::Shape {
                         levels: grid_levels,
@@ -325,7 +332,7 @@ impl Field {
                         bias,
                         tile,
                         straight,
-                        jacobian,
+                        kept: kept.min(1),
                     })?
                     .labelled(label),
                 tangent: gpu
@@ -333,7 +340,7 @@ impl Field {
                         levels: grid_levels,
                         features,
                         coordinates,
-                        jacobian,
+                        kept: kept.min(1),
                         ..field_tangent::Shape::default()
                     })?
                     .labelled(label),
@@ -342,6 +349,7 @@ impl Field {
                         levels: grid_levels,
                         features,
                         coordinates,
+                        kept: if kept == 2 { kept } else { 0 },
                         ..field_point_backward::Shape::default()
                     })?
                     .labelled(label),
@@ -421,22 +429,27 @@ impl Field {
         32.0 * f64::from(self.shape.grid.outputs())
     }
 
-    fn keeping_jacobian(&self) -> Option<&Kernel<field_forward::Args>> {
-        self.by_chain_rule.as_ref()?.encoding.as_ref()
+    /// Order up to which the encoding's derivatives are kept.
+    fn kept(&self) -> u32 {
+        self.by_chain_rule
+            .as_ref()
+            .map_or(0, |kernels| kernels.kept)
     }
 
-    fn jacobian_bytes(&self) -> f64 {
-        12.0 * f64::from(self.shape.grid.outputs())
+    /// Of the encoding's derivatives up to an order, at a point.
+    fn derivative_bytes(&self, order: u32) -> f64 {
+        12.0 * f64::from(order * self.shape.grid.outputs())
     }
 
-    /// Operations and bytes of a product with ∂e/∂x: it is read, or looked up once more.
-    fn jacobian_work(&self) -> (f64, f64) {
-        match self.keeping_jacobian() {
-            Some(_) => (
-                6.0 * f64::from(self.shape.grid.outputs()),
-                self.jacobian_bytes(),
+    /// Operations and bytes of a product with the encoding's derivatives up to an order: they are read, or looked up once more.
+    fn derivative_work(&self, order: u32) -> (f64, f64) {
+        let products = 6.0 * f64::from(order * self.shape.grid.outputs());
+        match self.kept() >= order {
+            true => (products, self.derivative_bytes(order)),
+            false => (
+                products + 4.0 * self.interpolation_flops(),
+                self.gather_bytes(),
             ),
-            None => (4.0 * self.interpolation_flops(), self.gather_bytes()),
         }
     }
 
@@ -484,10 +497,11 @@ impl Field {
         let levels = f64::from(self.shape.grid.levels);
         let mut flops = self.interpolation_flops();
         let mut bytes = self.gather_bytes() + self.row_bytes();
-        let keeping = buffers.slope.as_ref().and(self.keeping_jacobian());
+        let kernels = buffers.slope.as_ref().and(self.by_chain_rule.as_ref());
+        let keeping = kernels.and_then(|kernels| kernels.encoding.as_ref());
         if keeping.is_some() {
             flops *= 4.0;
-            bytes += self.jacobian_bytes();
+            bytes += self.derivative_bytes(self.kept());
         }
         let work = Work::items(u64::from(buffers.n))
             .slices(self.shape.grid.levels)
@@ -515,8 +529,8 @@ impl Field {
             inputs: buffers.inputs.ptr_mut(),
             hidden: buffers.hidden.ptr_mut(),
             first,
-            jacobian: match &buffers.slope {
-                Some(slope) => slope.jacobian(),
+            derivatives: match &buffers.slope {
+                Some(slope) => slope.derivatives(),
                 None => PtrMut::NULL,
             },
             n: buffers.n,
@@ -543,12 +557,12 @@ impl Field {
             head_weight: params.weight(self.heads, 0),
             points,
             inputs: buffers.inputs.ptr(),
-            jacobian: out.jacobian().read(),
+            derivatives: out.derivatives().read(),
             slopes: out.slopes.ptr_mut(),
             gradient: out.gradient.ptr_mut(),
             n,
         };
-        let (flops, bytes) = self.jacobian_work();
+        let (flops, bytes) = self.derivative_work(1);
         let flops = 2.0 * self.hidden_flops() + flops;
         let bytes = 2.0 * self.row_bytes() + bytes;
         let work = Work::items(u64::from(n)).flops(flops).bytes(bytes);
@@ -593,7 +607,7 @@ impl Field {
             levels: self.levels.ptr(),
             table: pass.params.values().ptr().offset(self.table),
             points: pass.points,
-            jacobian: slope.jacobian().read(),
+            derivatives: slope.derivatives().read(),
             d_gradient: slope.d_gradient.ptr(),
             tangents: pass.scratch.tangents.ptr_mut(),
             n: pass.buffers.n,
@@ -601,7 +615,7 @@ impl Field {
             end: pass.chunk.end,
         };
         let levels = f64::from(self.shape.grid.levels);
-        let (flops, bytes) = self.jacobian_work();
+        let (flops, bytes) = self.derivative_work(1);
         let work = Work::items(pass.chunk.len() as u64)
             .slices(self.shape.grid.levels)
             .flops(flops / levels)
@@ -730,6 +744,7 @@ impl Field {
             table: pass.params.values().ptr().offset(self.table),
             points: pass.points,
             d_inputs: pass.scratch.d_inputs.ptr(),
+            derivatives: slope.derivatives().read(),
             slopes: slope.slopes.ptr(),
             d_gradient: slope.d_gradient.ptr(),
             d_points,
@@ -737,9 +752,10 @@ impl Field {
             begin: pass.chunk.start,
             end: pass.chunk.end,
         };
+        let (flops, bytes) = self.derivative_work(2);
         let work = Work::items(pass.chunk.len() as u64)
-            .flops(8.0 * self.interpolation_flops())
-            .bytes(self.gather_bytes() + 2.0 * self.row_bytes());
+            .flops(flops)
+            .bytes(bytes + 2.0 * self.row_bytes());
         rec.run(&self.kernels().points, work, args);
     }
 

@@ -41,7 +41,7 @@ impl Proposal {
             coordinates: false,
             softplus: false,
             gradient: false,
-            jacobian: false,
+            kept: 0,
         }
     }
 

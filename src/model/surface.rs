@@ -74,12 +74,22 @@ pub struct ShadeInputs {
 
 const DIRECTION_ENCODING: u32 = 27;
 
-/// Bytes that the encoding's Jacobian at a batch of samples may take where it is kept.
-const MOST_JACOBIAN: u64 = 256 << 20;
+/// Bytes that the encoding's derivatives at a batch of samples may take where they are kept.
+const MOST_KEPT: u64 = 256 << 20;
 
 impl Surface {
     /// The field's shape in this configuration.
     pub fn field_shape(config: &Config) -> FieldShape {
+        Self::shape_that_keeps(1, config)
+    }
+
+    /// The same for the points of the tangent-normal loss, which hear what their gradient is to be.
+    pub fn beside_shape(config: &Config) -> FieldShape {
+        Self::shape_that_keeps(2, config)
+    }
+
+    /// Keeps derivatives up to this order, or as far as there is room.
+    fn shape_that_keeps(order: u32, config: &Config) -> FieldShape {
         let hash = &config.hash;
         let grid = HashGrid {
             levels: hash.levels,
@@ -88,17 +98,16 @@ impl Surface {
             log2_size: hash.log2_size,
             features: hash.features,
         };
+        let samples = u64::from(config.rays) * u64::from(config.sampling.samples);
+        let bytes_of_order = 12 * u64::from(grid.outputs()) * samples;
+        let room = (MOST_KEPT / bytes_of_order.max(1)).min(2) as u32;
         FieldShape {
             grid,
             hidden: config.surface.hidden,
             coordinates: true,
             softplus: true,
             gradient: config.surface.gradient == GradientKind::Analytic,
-            jacobian: 12
-                * u64::from(grid.outputs())
-                * u64::from(config.rays)
-                * u64::from(config.sampling.samples)
-                <= MOST_JACOBIAN,
+            kept: order.min(room),
         }
     }
 
@@ -240,7 +249,7 @@ impl Surface {
                 true => Some(Field::new(
                     gpu,
                     "tangent",
-                    shape,
+                    Self::beside_shape(config),
                     table,
                     hidden_weight,
                     heads_weight,

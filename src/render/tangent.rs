@@ -35,7 +35,7 @@ impl Tangent {
             points: gpu.scratch("tangent points", 3 * n64)?,
             d_points: gpu.scratch("tangent d_points", 3 * n64)?,
             d_sdf: gpu.buffer("tangent d_sdf", n64)?,
-            field: FieldBuffers::new(gpu, "tangent", &Surface::field_shape(config), n, 0)?,
+            field: FieldBuffers::new(gpu, "tangent", &Surface::beside_shape(config), n, 0)?,
             place: gpu.kernel(tangent_points::Shape::default())?,
             compare: gpu.kernel(tangent_loss::Shape::default())?,
             place_backward: gpu.kernel(tangent_points_backward::Shape::default())?,

@@ -1,5 +1,5 @@
 //! A field's backward pass over more points than it takes at once, and over points with heads and without, is the sum of passes over
-//! fewer; straight-line code makes the same of a field as loops do, and a kept Jacobian the same as one looked up.
+//! fewer; straight-line code makes the same of a field as loops do, and derivatives that are kept the same as those looked up.
 
 use crate::harness::assert_gradient;
 use neurodin::Result;
@@ -20,7 +20,7 @@ const SHAPE: FieldShape = FieldShape {
     coordinates: true,
     softplus: true,
     gradient: true,
-    jacobian: true,
+    kept: 2,
 };
 const POINTS: usize = 70_001;
 /// Leading points with heads.
@@ -167,20 +167,21 @@ fn many_points_are_the_sum_of_fewer() -> Result<()> {
 }
 
 #[test]
-fn a_jacobian_that_is_kept_is_the_one_looked_up() -> Result<()> {
+fn derivatives_that_are_kept_are_those_looked_up() -> Result<()> {
     let gpu = &open(&[])?;
-    let looked_up = FieldShape {
-        jacobian: false,
-        ..SHAPE
-    };
-    let (kept, looked_up) = (field(gpu, SHAPE)?, field(gpu, looked_up)?);
+    let keeping = |kept| field(gpu, FieldShape { kept, ..SHAPE });
     // Both halves of a pass that is cut.
     let range = 1..POINTS;
-    let got = backward(gpu, &kept, range.clone())?;
-    let want = backward(gpu, &looked_up, range)?;
-    assert_gradient("what the points hear", &wide(&got), &wide(&want));
+    let looked_up = keeping(0)?;
+    let want_points = backward(gpu, &looked_up, range.clone())?;
     let want = gradients(gpu, &looked_up.1)?;
-    assert_gradients(&kept.1, &gradients(gpu, &kept.1)?, &want);
+    for order in [1, 2] {
+        let kept = keeping(order)?;
+        let got = backward(gpu, &kept, range.clone())?;
+        let what = format!("what the points hear, derivatives kept up to order {order}");
+        assert_gradient(&what, &wide(&got), &wide(&want_points));
+        assert_gradients(&kept.1, &gradients(gpu, &kept.1)?, &want);
+    }
     assert_valid(gpu);
     Ok(())
 }
