@@ -2,10 +2,11 @@
 // AdamW, two parameters per invocation. Parameters without gradient decay and move on by their momentum like all others. A step whose
 // loss is not finite changes nothing.
 #include "lib/prelude.glsl"
-#include "lib/adam.glsl"
+#include "lib/update_pair.glsl"
 
 layout(push_constant, scalar) uniform Args {
     F32sMut params;        // [n] updated in place
+    U32sMut halves;        // [n / 2] their copy, with HALF
     SumsMut grads;         // [n] consumed: zeroed for the next step
     F32sMut first_moment;  // [n]
     F32sMut second_moment; // [n]
@@ -23,5 +24,5 @@ void main() {
     uint i = 2u * item();
     if (i >= n) return;
     Rates rates = Rates(rate, decay, correction, one_minus_beta1, one_minus_beta2, epsilon);
-    update_pair(params, grads, first_moment, second_moment, i, bad_step.at[0] != 0u, rates);
+    update_pair(params, halves, grads, first_moment, second_moment, i, bad_step.at[0] != 0u, rates);
 }

@@ -6,6 +6,7 @@
 #include "lib/prelude.glsl"
 #include "lib/hash_grid.glsl"
 #include "lib/field.glsl"
+#include "lib/look_up.glsl"
 
 // 1: the first n_hidden points have further heads; 0: none at hand has. (With 1 lavapipe branches per lane at every store of h: a launch for
 // those that have and one for the others is faster.)
@@ -17,7 +18,7 @@ layout(constant_id = 10) const uint KEPT = 0;     // order up to which PART 1 ke
 
 layout(push_constant, scalar) uniform Args {
     Levels levels;
-    F32s table;          // [entries, FEATURES]
+    U32s table;          // [entries, FEATURES], or its copy (lib/look_up.glsl)
     F32s hidden_weight;  // [HIDDEN, INPUTS]
     F32s hidden_bias;    // [HIDDEN]
     F32s head_weight;    // [HIDDEN]
@@ -55,7 +56,7 @@ void main() {
             [[unroll]] for (uint corner = 0u; corner < 8u; ++corner) entries[corner] = corner_entry(level, cell, corner);
             [[unroll]] for (uint k = 0u; k < PAIRS; ++k) {
                 vec2 corners[8];
-                [[unroll]] for (uint corner = 0u; corner < 8u; ++corner) corners[corner] = load_features(table, entries[corner], k);
+                [[unroll]] for (uint corner = 0u; corner < 8u; ++corner) corners[corner] = look_up(table, entries[corner], k);
                 Interpolation e = interpolate(corners, cell.weight);
                 [[unroll]] for (uint f = 2u * k; f < min(2u * k + 2u, FEATURES); ++f) {
                     uint feature = l * FEATURES + f;

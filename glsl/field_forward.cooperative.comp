@@ -15,7 +15,7 @@ const bool A_IS_COLUMN_MAJOR = false, B_IS_COLUMN_MAJOR = false;
 
 layout(push_constant, scalar) uniform Args {
     Levels levels;
-    F32s table;          // [entries, FEATURES]
+    U32s table;          // PART 0 and 1 alone
     F32s hidden_weight;  // [HIDDEN, INPUTS]
     F32s hidden_bias;    // [HIDDEN]
     F32s head_weight;    // [HIDDEN]

@@ -5,6 +5,7 @@
 #include "lib/prelude.glsl"
 #include "lib/hash_grid.glsl"
 #include "lib/field.glsl"
+#include "lib/look_up.glsl"
 
 layout(constant_id = 7) const uint STRAIGHT = 0;
 layout(constant_id = 8) const uint KEPT = 0;  // 1: field_forward has kept ∂e/∂x; 0: the table is looked up once more
@@ -12,7 +13,7 @@ layout(constant_id = 8) const uint KEPT = 0;  // 1: field_forward has kept ∂e/
 
 layout(push_constant, scalar) uniform Args {
     Levels levels;
-    F32s table;          // [entries, FEATURES]
+    U32s table;          // [entries, FEATURES], or its copy (lib/look_up.glsl)
     F32s hidden_weight;  // [HIDDEN, INPUTS]
     F32s hidden_bias;    // [HIDDEN]
     F32s head_weight;    // [HIDDEN]
@@ -66,7 +67,7 @@ void main() {
         [[unroll]] for (uint corner = 0u; corner < 8u; ++corner) {
             uint entry = corner_entry(level, cell, corner);
             corners[corner] = vec2(0.0);
-            [[unroll]] for (uint k = 0u; k < PAIRS; ++k) corners[corner].x += dot(slope[k], load_features(table, entry, k));
+            [[unroll]] for (uint k = 0u; k < PAIRS; ++k) corners[corner].x += dot(slope[k], look_up(table, entry, k));
         }
         g += slope_of(level, interpolate(corners, cell.weight), 0u);
     }

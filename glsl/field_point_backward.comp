@@ -5,12 +5,13 @@
 #include "lib/prelude.glsl"
 #include "lib/hash_grid.glsl"
 #include "lib/field.glsl"
+#include "lib/look_up.glsl"
 
 layout(constant_id = 7) const uint KEPT = 0; // 2: field_forward has kept the encoding's derivatives; 0: the table is looked up once more
 
 layout(push_constant, scalar) uniform Args {
     Levels levels;
-    F32s table;       // [entries, FEATURES]
+    U32s table;       // [entries, FEATURES], or its copy (lib/look_up.glsl)
     F32s points;      // [3, n]
     F32s d_inputs;    // [INPUTS, end - begin] d_z
     F32s derivatives; // [6, LEVELS·FEATURES, n] ∂e/∂x and ∂²e/∂x², where KEPT
@@ -51,7 +52,7 @@ void main() {
             uint entry = corner_entry(level, cell, corner);
             corners[corner] = vec2(0.0);
             [[unroll]] for (uint k = 0u; k < PAIRS; ++k) {
-                vec2 stored = load_features(table, entry, k);
+                vec2 stored = look_up(table, entry, k);
                 corners[corner] += vec2(dot(d_e[k], stored), dot(slope[k], stored));
             }
         }

@@ -4,12 +4,13 @@
 #include "lib/prelude.glsl"
 #include "lib/hash_grid.glsl"
 #include "lib/field.glsl"
+#include "lib/look_up.glsl"
 
 layout(constant_id = 7) const uint KEPT = 0; // 1: field_forward has kept ∂e/∂x; 0: the table is looked up once more
 
 layout(push_constant, scalar) uniform Args {
     Levels levels;
-    F32s table;       // [entries, FEATURES]
+    U32s table;       // [entries, FEATURES], or its copy (lib/look_up.glsl)
     F32s points;      // [3, n]
     F32s derivatives; // [3, LEVELS·FEATURES, n] ∂e/∂x, where KEPT
     F32s d_gradient;  // [3, n] v
@@ -40,7 +41,7 @@ void main() {
     [[unroll]] for (uint corner = 0u; corner < 8u; ++corner) entries[corner] = corner_entry(level, cell, corner);
     [[unroll]] for (uint k = 0u; k < PAIRS; ++k) {
         vec2 corners[8];
-        [[unroll]] for (uint corner = 0u; corner < 8u; ++corner) corners[corner] = load_features(table, entries[corner], k);
+        [[unroll]] for (uint corner = 0u; corner < 8u; ++corner) corners[corner] = look_up(table, entries[corner], k);
         Interpolation e = interpolate(corners, cell.weight);
         [[unroll]] for (uint f = 2u * k; f < min(2u * k + 2u, FEATURES); ++f) {
             tangents.at[(COORDINATES + l * FEATURES + f) * count + item()] = dot(slope_of(level, e, f % 2u), v);

@@ -9,6 +9,7 @@
 layout(constant_id = 0) const uint FEATURES = 2;
 layout(constant_id = 1) const uint STRIP = 16;  // words of 32 marks: long strips have equally much to do, short ones are many
 #include "lib/entry.glsl"
+#include "lib/half_copy.glsl"
 
 layout(push_constant, scalar) uniform Args {
     Levels levels;
@@ -19,6 +20,7 @@ layout(push_constant, scalar) uniform Args {
     U32sMut settled;        // [slots / 32] a bit each: marks that have been seen to
     U32sMut stamps;         // [slots / 4] a byte each
     F32sMut table;          // [entries, FEATURES]
+    U32sMut halves;         // [entries, FEATURES / 2] its copy, with HALF
     SumsMut grads;          // [entries, FEATURES] consumed
     F32sMut first_moment;   // [entries, FEATURES]
     F32sMut second_moment;  // [entries, FEATURES]
@@ -51,7 +53,9 @@ void settle(uint entry, uint slot, uint now) {
     if (next == now) row.lag = NO_LAG;
     [[unroll]] for (uint k = 0u; k < PAIRS; ++k) {
         AdamState updated = adam_step(x[k], g[k], rates);
-        store_features(table, entry, k, caught_up(updated, row.lag, rows, next, now, rates));
+        vec2 p = caught_up(updated, row.lag, rows, next, now, rates);
+        store_features(table, entry, k, p);
+        copy_pair(halves, entry * FEATURES + 2u * k, p);
         store_features(first_moment, entry, k, row.lag.first * updated.m);
         store_features(second_moment, entry, k, row.lag.second * updated.v);
         clear_sums(grads, entry, k);

@@ -4,6 +4,7 @@
 #include "lib/prelude.glsl"
 #include "lib/hash_grid.glsl"
 #include "lib/lazy_table.glsl"
+#include "lib/update_pair.glsl"
 
 layout(constant_id = 0) const uint FEATURES = 2;
 layout(constant_id = 1) const uint TURNS = 64;  // pairs of parameters of an invocation: few workgroups where there is nothing to do
@@ -14,6 +15,7 @@ layout(push_constant, scalar) uniform Args {
     U32s clock;             // [1]
     U32s bad_step;          // [1] non-zero: losses not finite
     F32sMut table;          // [entries, FEATURES]
+    U32sMut halves;         // [entries, FEATURES / 2] its copy, with HALF
     SumsMut grads;          // [entries, FEATURES] consumed
     F32sMut first_moment;   // [entries, FEATURES]
     F32sMut second_moment;  // [entries, FEATURES]
@@ -40,7 +42,7 @@ void main() {
         [[unroll]] for (uint k = 0u; k < AT_ONCE; ++k) {
             uint j = 2u * (first + (turn + k) * LOCAL_SIZE);
             // Levels have an even number of entries.
-            if (j < n_params) update_pair(table, grads, first_moment, second_moment, level.offset * FEATURES + j, bad, rates);
+            if (j < n_params) update_pair(table, halves, grads, first_moment, second_moment, level.offset * FEATURES + j, bad, rates);
         }
     }
     // The next step marks this level again, and needs its stamps.

@@ -162,6 +162,8 @@ pub struct HashConfig {
     pub log2_size: u32,
     /// Features per level: 1, 2, 4 or 8.
     pub features: u32,
+    /// Look-ups read a copy of the table in float16, into which updates are rounded.
+    pub half: bool,
     pub release: ReleaseConfig,
 }
 

@@ -1,5 +1,4 @@
 // One step of AdamW with decoupled decay (Loshchilov & Hutter 2019, algorithm 2; Adam where λ is 0), of parameters and their moments.
-#include "lib/sums.glsl"
 
 // Two parameters that lie side by side, and their moments.
 struct AdamState {
@@ -23,16 +22,4 @@ AdamState adam_step(AdamState x, vec2 g, Rates r) {
     vec2 m = fma(vec2(r.one_minus_beta1), g - x.m, x.m);
     vec2 v = fma(vec2(r.one_minus_beta2), g * g - x.v, x.v);
     return AdamState(x.p - fma(vec2(r.decay), x.p, r.rate * m / (sqrt(v) / r.correction + r.epsilon)), m, v);
-}
-
-// The step of two parameters from an even index i on; their gradients are consumed. A bad step changes nothing else.
-void update_pair(F32sMut params, SumsMut grads, F32sMut first_moment, F32sMut second_moment, uint i, bool bad, Rates rates) {
-    vec2 g = sums_at(grads, i);
-    clear_pair(grads, i);
-    if (bad) return;
-    AdamState x = AdamState(pair_at(reading(params), i), pair_at(reading(first_moment), i), pair_at(reading(second_moment), i));
-    x = adam_step(x, g, rates);
-    set_pair(params, i, x.p);
-    set_pair(first_moment, i, x.m);
-    set_pair(second_moment, i, x.v);
 }

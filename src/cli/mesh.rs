@@ -154,10 +154,11 @@ pub(super) fn take(args: &MeshArgs, context: &Context) -> anyhow::Result<Option<
         }
         .into());
     }
-    if stats.steepest > STEEPEST {
+    if stats.blocks_skipped > 0 && stats.steepest > STEEPEST {
         context.warn(&format!(
-            "the signed distance has slopes up to {:.1}, above the {STEEPEST} that was supposed: --exhaustive makes sure that nothing is missing",
-            stats.steepest
+            "{} of {} blocks were left out as far from the surface, but the signed distance has slopes up to {:.1}, above the {STEEPEST} that was \
+             supposed: --exhaustive makes sure that nothing is missing",
+            stats.blocks_skipped, stats.blocks, stats.steepest
         ));
     }
     let out_from_region = match args.frame {

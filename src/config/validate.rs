@@ -34,6 +34,13 @@ impl Config {
             hash.log2_size,
             hash.features,
         );
+        if hash.half && hash.features == 1 {
+            wrong.add(
+                "hash.half",
+                hash.half,
+                "false where hash.features is 1: float16s lie in pairs",
+            );
+        }
         wrong.whole("hash.release.first", hash.release.first, 0, 16);
         wrong.whole("hash.release.every", hash.release.every, 1, 100_000_000);
         wrong.network("surface.hidden", self.surface.hidden);

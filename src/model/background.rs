@@ -56,6 +56,7 @@ impl Background {
             softplus: false,
             gradient: false,
             kept: 0,
+            half: false,
         })
     }
 

@@ -29,6 +29,8 @@ pub struct FieldShape {
     /// Order up to which devices with few cores keep the encoding's derivatives of every point, for 12 bytes a feature, point and order, in
     /// place of looking them up again: 0; 1, all that the gradient needs; 2, those that the points' own gradients need as well.
     pub kept: u32,
+    /// Look-ups read a copy of the table in float16 ([`ParamsPlan::keep_half`](super::ParamsPlan::keep_half)).
+    pub half: bool,
 }
 
 impl FieldShape {
@@ -243,6 +245,7 @@ impl Field {
         let coordinates = shape.coordinate_inputs();
         let second_order = u32::from(shape.gradient);
         let kept = shape.kept_on(gpu);
+        let half = u32::from(shape.half);
         let softplus = u32::from(shape.softplus);
         let bias = u32::from(hidden.bias.is_some());
         let tile = shape.hidden.min(8);
@@ -264,6 +267,7 @@ impl Field {
             part: 0,
             straight,
             kept: 0,
+            half,
         };
         let backward = field_backward::Shape {
             levels: grid_levels,
@@ -333,6 +337,7 @@ impl Field {
                         tile,
                         straight,
                         kept: kept.min(1),
+                        half,
                     })?
                     .labelled(label),
                 tangent: gpu
@@ -341,6 +346,7 @@ impl Field {
                         features,
                         coordinates,
                         kept: kept.min(1),
+                        half,
                         ..field_tangent::Shape::default()
                     })?
                     .labelled(label),
@@ -350,6 +356,7 @@ impl Field {
                         features,
                         coordinates,
                         kept: if kept == 2 { kept } else { 0 },
+                        half,
                         ..field_point_backward::Shape::default()
                     })?
                     .labelled(label),
@@ -426,7 +433,8 @@ impl Field {
     }
 
     fn gather_bytes(&self) -> f64 {
-        32.0 * f64::from(self.shape.grid.outputs())
+        let of_feature = if self.shape.half { 16.0 } else { 32.0 };
+        of_feature * f64::from(self.shape.grid.outputs())
     }
 
     /// Order up to which the encoding's derivatives are kept.
@@ -520,7 +528,7 @@ impl Field {
     ) -> field_forward::Args {
         field_forward::Args {
             levels: self.levels.ptr(),
-            table: params.values().ptr().offset(self.table),
+            table: params.table(self.table),
             hidden_weight: params.weight(self.hidden, 0),
             hidden_bias: params.bias(self.hidden, 0),
             head_weight: params.weight(self.heads, 0),
@@ -551,7 +559,7 @@ impl Field {
         let (n, out) = (buffers.n, buffers.slope());
         let args = field_gradient::Args {
             levels: self.levels.ptr(),
-            table: params.values().ptr().offset(self.table),
+            table: params.table(self.table),
             hidden_weight: params.weight(self.hidden, 0),
             hidden_bias: params.bias(self.hidden, 0),
             head_weight: params.weight(self.heads, 0),
@@ -605,7 +613,7 @@ impl Field {
     fn tangent(&self, rec: &mut Recorder, pass: &Pass, slope: &Slope) {
         let args = field_tangent::Args {
             levels: self.levels.ptr(),
-            table: pass.params.values().ptr().offset(self.table),
+            table: pass.params.table(self.table),
             points: pass.points,
             derivatives: slope.derivatives().read(),
             d_gradient: slope.d_gradient.ptr(),
@@ -741,7 +749,7 @@ impl Field {
         let slope = pass.buffers.slope();
         let args = field_point_backward::Args {
             levels: self.levels.ptr(),
-            table: pass.params.values().ptr().offset(self.table),
+            table: pass.params.table(self.table),
             points: pass.points,
             d_inputs: pass.scratch.d_inputs.ptr(),
             derivatives: slope.derivatives().read(),

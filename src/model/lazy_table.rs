@@ -94,13 +94,15 @@ const LEAST_BETA2: f64 = 0.75;
 
 impl LazyTable {
     /// The table of a grid that a training step asks at `points`, at an element offset of the parameter block; nothing is touched or
-    /// behind at first. `None` where every level is better updated whole, or β₂ is so small that it has to be.
+    /// behind at first. `half`: it has a copy in float16. `None` where every level is better updated whole, or β₂ is so small that it has
+    /// to be.
     pub fn new(
         gpu: &Gpu,
         grid: &HashGrid,
         table: u64,
         optimizer: &OptimizerConfig,
         points: u32,
+        half: bool,
     ) -> Result<Option<LazyTable>> {
         let visits = 8 * u64::from(points);
         let features = grid.features;
@@ -122,8 +124,10 @@ impl LazyTable {
             true => (32, 0.35),
             false => (2, 0.65),
         };
+        let half = u32::from(half);
         let whole = table_update_whole::Shape {
             features,
+            half,
             ..table_update_whole::Shape::default()
         };
         let forget = table_forget::Shape {
@@ -158,7 +162,11 @@ impl LazyTable {
             ),
             tick: gpu.kernel(table_clock::Shape { levels: n_levels })?,
             settle: Sweep::new(
-                gpu.kernel(table_settle::Shape { features, strip })?,
+                gpu.kernel(table_settle::Shape {
+                    features,
+                    strip,
+                    half,
+                })?,
                 WORD * u64::from(strip),
             ),
         }))
@@ -217,6 +225,7 @@ impl LazyTable {
             clock: self.clock.ptr(),
             bad_step: bad_step.ptr(),
             table: params.values().at_mut(self.table),
+            halves: params.copy_of(self.table),
             grads: params.d_value(self.table),
             first_moment: params.first_moment().at_mut(self.table),
             second_moment: params.second_moment().at_mut(self.table),
@@ -269,6 +278,7 @@ impl LazyTable {
             settled: self.settled.ptr_mut(),
             stamps: self.stamps.ptr_mut(),
             table: params.values().at_mut(self.table),
+            halves: params.copy_of(self.table),
             grads: params.d_value(self.table),
             first_moment: params.first_moment().at_mut(self.table),
             second_moment: params.second_moment().at_mut(self.table),

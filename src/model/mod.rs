@@ -4,6 +4,7 @@ mod appearance;
 mod background;
 mod field;
 mod forms;
+mod half_copy;
 mod hash_grid;
 mod layer;
 mod lazy_table;
@@ -57,8 +58,15 @@ impl Model {
             true => {
                 let beside = u32::from(config.loss.tangent > 0.0);
                 let points = config.rays * config.sampling.samples * (surface.blocks() + beside);
-                let (grid, table) = (&surface.field.shape.grid, surface.field.table());
-                LazyTable::new(gpu, grid, table, &config.optimizer, points)?
+                let (shape, table) = (&surface.field.shape, surface.field.table());
+                LazyTable::new(
+                    gpu,
+                    &shape.grid,
+                    table,
+                    &config.optimizer,
+                    points,
+                    shape.half,
+                )?
             }
             false => None,
         };

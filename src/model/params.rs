@@ -3,6 +3,7 @@
 //! Weight-normalised layers keep direction v and length g in the block; the matrices that kernels multiply by, W = g·v/‖v‖, stand in
 //! a second, small block that is refreshed at the beginning of a step and whose gradient is folded back at its end.
 
+use super::half_copy::HalfCopy;
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, Kernel, Ptr, PtrMut, Recorder, Work};
 use crate::kernels::{self, WeightRow, weight_norm_backward, weight_norm_forward};
@@ -83,6 +84,8 @@ pub struct ParamsPlan {
     rows: Vec<WeightRow>,
     len: u64,
     effective_len: u64,
+    /// First element of the table that look-ups read in float16, if there is one.
+    in_half: Option<u64>,
 }
 
 /// Spans begin at multiples of this many elements, so that vector loads stay possible.
@@ -181,6 +184,11 @@ impl ParamsPlan {
         }
     }
 
+    /// Look-ups read the table at this element, which has features in pairs, in float16.
+    pub fn keep_half(&mut self, table: u64) {
+        self.in_half = Some(table);
+    }
+
     /// Elements in the block.
     pub fn len(&self) -> u64 {
         self.len
@@ -214,7 +222,15 @@ impl ParamsPlan {
             }),
             false => None,
         };
-        Ok(Params {
+        let of_table = |table| {
+            // (An empty span may begin at the same place.)
+            let is_table = |span: &&Span| span.first == table && !span.is_empty();
+            let span = self.spans.iter().map(|(span, _)| span).find(is_table);
+            let span = span.expect("a table is a span");
+            HalfCopy::new(gpu, span.first..span.first + span.len())
+        };
+        let params = Params {
+            half: self.in_half.map(of_table).transpose()?,
             learning,
             effective: gpu.buffer("effective weights", self.effective_len.max(1))?,
             d_effective: gpu.buffer(
@@ -228,7 +244,9 @@ impl ParamsPlan {
             backward: gpu.kernel(weight_norm_backward::Shape::default())?,
             values,
             spans: self.spans.into_iter().map(|(span, _)| span).collect(),
-        })
+        };
+        params.refresh_copy(gpu)?;
+        Ok(params)
     }
 }
 
@@ -302,6 +320,7 @@ struct Learning {
 pub struct Params {
     spans: Vec<Span>,
     values: Buffer<f32>, // [len]
+    half: Option<HalfCopy>,
     learning: Option<Learning>,
     effective: Buffer<f32>, // [effective_len] W of every weight-normalised layer
     d_effective: Buffer<f32>, // [effective_len] sums, zero between steps
@@ -337,6 +356,39 @@ impl Params {
     pub fn values(&self) -> &Buffer<f32> {
         &self.values
     }
+
+    /// What look-ups read of the table at this element: its values, or their copy in float16.
+    pub fn table(&self, first: u64) -> Ptr<u32> {
+        let copy = self.half.as_ref().and_then(|half| half.of(first));
+        copy.map_or(self.values.at(first).cast(), |copy| copy.read())
+    }
+
+    /// Where the copy of the values from this element on is kept; nowhere if they have none.
+    pub fn copy_of(&self, first: u64) -> PtrMut<u32> {
+        let copy = self.half.as_ref().and_then(|half| half.of(first));
+        copy.unwrap_or(PtrMut::NULL)
+    }
+
+    /// The copy in float16 of the table that has one, features in pairs.
+    pub fn copy(&self) -> Option<&Buffer<u32>> {
+        self.half.as_ref().map(HalfCopy::pairs)
+    }
+
+    /// To be called when values were written from outside.
+    ///
+    /// # Errors
+    /// What the device fails with.
+    pub fn refresh_copy(&self, gpu: &Gpu) -> Result<()> {
+        let Some(half) = &self.half else {
+            return Ok(());
+        };
+        gpu.submit("float16 copy", |rec| {
+            half.refresh(rec, &self.values);
+            Ok(())
+        })?;
+        Ok(())
+    }
+
     pub fn grads(&self) -> &Buffer<f32> {
         &self.learning().grads
     }

@@ -42,6 +42,7 @@ impl Proposal {
             softplus: false,
             gradient: false,
             kept: 0,
+            half: false,
         }
     }
 

@@ -108,6 +108,7 @@ impl Surface {
             softplus: true,
             gradient: config.surface.gradient == GradientKind::Analytic,
             kept: order.min(room),
+            half: hash.half,
         }
     }
 
@@ -223,6 +224,9 @@ impl Surface {
             &[entries, u64::from(shape.grid.features)],
             Init::Uniform { half_range: 1e-4 },
         );
+        if shape.half {
+            plan.keep_half(table);
+        }
 
         let head_shape = LayerShape {
             inputs: hidden,

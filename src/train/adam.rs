@@ -12,6 +12,8 @@ use crate::model::{Group, Model, Rates};
 pub struct Adam {
     config: OptimizerConfig,
     kernel: Kernel<adam::Args>,
+    /// For a table that has a copy in float16.
+    with_copy: Kernel<adam::Args>,
 }
 
 impl Adam {
@@ -20,6 +22,7 @@ impl Adam {
         Ok(Adam {
             config: config.optimizer.clone(),
             kernel: gpu.kernel(adam::Shape::default())?,
+            with_copy: gpu.kernel(adam::Shape { half: 1 })?,
         })
     }
 
@@ -53,6 +56,7 @@ impl Adam {
             let n = range.end - range.start;
             let args = adam::Args {
                 params: params.values().at_mut(range.start),
+                halves: params.copy_of(range.start),
                 grads: params.d_value(range.start),
                 first_moment: params.first_moment().at_mut(range.start),
                 second_moment: params.second_moment().at_mut(range.start),
@@ -65,8 +69,12 @@ impl Adam {
                 one_minus_beta2: (1.0 - c.beta2) as f32,
                 epsilon: c.epsilon as f32,
             };
+            let kernel = match args.halves.address() {
+                0 => &self.kernel,
+                _ => &self.with_copy,
+            };
             rec.run(
-                &self.kernel,
+                kernel,
                 Work::items(n.div_ceil(2)).flops(30.0).bytes(64.0),
                 args,
             );

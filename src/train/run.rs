@@ -300,6 +300,7 @@ impl Trainer {
                 self.gpu.upload(buffer, first + offset, numbers)
             })?;
         }
+        self.model.params.refresh_copy(&self.gpu)?;
         if let Some(table) = &self.model.table {
             self.gpu.submit("reset", |rec| {
                 table.reset(rec, &self.model.params);

@@ -51,6 +51,7 @@ impl Trained {
                 gpu.upload(values, span.first + first, numbers)
             })?;
         }
+        model.params.refresh_copy(gpu)?;
         let mean = state.config.appearance.at_eval == AppearanceAtEval::Mean;
         model.set_evaluation_code(gpu, mean)?;
         gpu.finish()?;

@@ -1,6 +1,7 @@
 //! A field's backward pass over more points than it takes at once, and over points with heads and without, is the sum of passes over
 //! fewer; straight-line code makes the same of a field as loops do, and derivatives that are kept the same as those looked up.
 
+use crate::half_copy::cut;
 use crate::harness::assert_gradient;
 use neurodin::Result;
 use neurodin::gpu::{Gpu, GpuOptions};
@@ -21,6 +22,7 @@ const SHAPE: FieldShape = FieldShape {
     softplus: true,
     gradient: true,
     kept: 2,
+    half: false,
 };
 const POINTS: usize = 70_001;
 /// Leading points with heads.
@@ -61,10 +63,18 @@ fn assert_valid(gpu: &Gpu) {
 fn field(gpu: &Gpu, shape: FieldShape) -> Result<(Field, Params)> {
     let mut plan = ParamsPlan::default();
     let (hidden, inputs) = (SHAPE.hidden, SHAPE.inputs());
-    let table = [SHAPE.grid.entries(), u64::from(SHAPE.grid.features)];
     let values = |of, n| (0..n).map(|i| 0.3 * noise(of, i)).collect::<Vec<f32>>();
-    let entries = values(1, (table[0] * table[1]) as usize);
-    let table = plan.add(Group::Table, "table", &table, Init::Values(entries));
+    // Numbers that float16 has as well.
+    let features = values(
+        1,
+        (SHAPE.grid.entries() * u64::from(SHAPE.grid.features)) as usize,
+    );
+    let features = features.iter().map(|&x| cut(x.into()) as f32).collect();
+    let table = [SHAPE.grid.entries(), u64::from(SHAPE.grid.features)];
+    let table = plan.add(Group::Table, "table", &table, Init::Values(features));
+    if shape.half {
+        plan.keep_half(table);
+    }
     let mut matrix = |name, of, rows: u32, columns: u32| {
         let weights = values(of, (rows * columns) as usize);
         plan.add_plain(Group::Fields, name, rows.into(), columns.into(), weights)
@@ -181,6 +191,37 @@ fn derivatives_that_are_kept_are_those_looked_up() -> Result<()> {
         let what = format!("what the points hear, derivatives kept up to order {order}");
         assert_gradient(&what, &wide(&got), &wide(&want_points));
         assert_gradients(&kept.1, &gradients(gpu, &kept.1)?, &want);
+    }
+    assert_valid(gpu);
+    Ok(())
+}
+
+/// Every look-up reads the copy: the table itself may be gone.
+#[test]
+fn a_copy_in_float16_is_the_same_table() -> Result<()> {
+    let gpu = &open(&[])?;
+    let range = 0..5_001;
+    for kept in [0, 2] {
+        let shape = FieldShape { kept, ..SHAPE };
+        let whole = field(gpu, shape)?;
+        let want_points = backward(gpu, &whole, range.clone())?;
+        let want = gradients(gpu, &whole.1)?;
+        let half = field(
+            gpu,
+            FieldShape {
+                half: true,
+                ..shape
+            },
+        )?;
+        let table = half.1.span("table").expect("the table");
+        let nothing = vec![0.0; table.len() as usize];
+        gpu.upload(half.1.values(), table.first, &nothing)?;
+        let got = backward(gpu, &half, range.clone())?;
+        assert_gradient("what the points hear", &wide(&got), &wide(&want_points));
+        assert_gradients(&half.1, &gradients(gpu, &half.1)?, &want);
+        half.1.refresh_copy(gpu)?;
+        let of_nothing = backward(gpu, &half, range.clone())?;
+        assert_ne!(of_nothing, got, "a copy that is made again");
     }
     assert_valid(gpu);
     Ok(())

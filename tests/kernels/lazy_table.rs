@@ -1,5 +1,6 @@
 //! The lazily updated hash table against AdamW of every entry in every step, in float64 and in float32.
 
+use crate::half_copy::assert_copy;
 use crate::harness::Random;
 use crate::optimizer::Adam;
 use neurodin::Result;
@@ -75,7 +76,8 @@ fn corners(point: [f32; 3]) -> Vec<usize> {
 }
 
 impl Bench {
-    fn new(decay: f64, portable: bool) -> Result<Bench> {
+    /// `half`: with a copy of the table in float16.
+    fn new(decay: f64, portable: bool, half: bool) -> Result<Bench> {
         let gpu = Gpu::new(&GpuOptions {
             validation: true,
             guard: true,
@@ -91,9 +93,12 @@ impl Bench {
         plan.add(Group::Fields, "before", &[BEFORE], pad);
         let table = Init::Values(values.iter().map(|&x| x as f32).collect());
         let first = plan.add(Group::Table, "table", &[GRID.entries(), 2], table);
+        if half {
+            plan.keep_half(first);
+        }
         let params = plan.build(&gpu, 1, true)?;
-        let lazy =
-            LazyTable::new(&gpu, &GRID, first, &optimizer, 4)?.expect("levels to be lazy with");
+        let lazy = LazyTable::new(&gpu, &GRID, first, &optimizer, 4, half)?;
+        let lazy = lazy.expect("levels to be lazy with");
         assert_eq!(lazy.first(), first, "the smallest level is one of them");
         let flag = |value: u32| -> Result<Buffer<u32>> {
             let flag = gpu.buffer("bad step", 1)?;
@@ -258,6 +263,9 @@ impl Bench {
                 "parameter {i} is {off:e} off at step {step}, in float32 {unavoidable:e}"
             );
         }
+        if let Some(copy) = self.params.copy() {
+            assert_copy(&self.gpu.download(copy, 0, copy.len())?, &values);
+        }
         let of_its_size = |x: f64| x.max(1e-30);
         let (m, i) = worst(
             &self.download(self.params.first_moment())?,
@@ -316,8 +324,8 @@ fn batch_of(step: u64, random: &mut Random) -> usize {
     }
 }
 
-fn ten_thousand_steps(decay: f64, portable: bool) -> Result<()> {
-    let mut bench = Bench::new(decay, portable)?;
+fn ten_thousand_steps(decay: f64, portable: bool, half: bool) -> Result<()> {
+    let mut bench = Bench::new(decay, portable, half)?;
     let used: BTreeSet<usize> = bench
         .batches
         .iter()
@@ -350,7 +358,7 @@ fn too_short_a_memory_has_no_closed_form() -> Result<()> {
             beta2,
             ..Config::default().optimizer
         };
-        let table = LazyTable::new(&gpu, &GRID, BEFORE, &optimizer, 1)?;
+        let table = LazyTable::new(&gpu, &GRID, BEFORE, &optimizer, 1, false)?;
         assert_eq!(table.is_some(), lazy, "{beta2}");
     }
     Ok(())
@@ -358,17 +366,17 @@ fn too_short_a_memory_has_no_closed_form() -> Result<()> {
 
 #[test]
 fn ten_thousand_steps_are_those_of_adamw() -> Result<()> {
-    ten_thousand_steps(0.01, false)
+    ten_thousand_steps(0.01, false, false)
 }
 
 #[test]
-fn ten_thousand_steps_without_decay_by_the_portable_kernels() -> Result<()> {
-    ten_thousand_steps(0.0, true)
+fn ten_thousand_steps_without_decay_by_the_portable_kernels_with_a_copy() -> Result<()> {
+    ten_thousand_steps(0.0, true, true)
 }
 
 #[test]
 fn what_is_touched_is_up_to_date_before_it_is_read() -> Result<()> {
-    let mut bench = Bench::new(0.01, false)?;
+    let mut bench = Bench::new(0.01, false, false)?;
     let gpu = bench.gpu.clone();
     let mut random = Random(5);
     for first in (0..600u64).step_by(30) {
@@ -402,7 +410,7 @@ fn what_is_touched_is_up_to_date_before_it_is_read() -> Result<()> {
 /// A checkpoint holds a flushed table: going on with it and going on from it are the same to the last bit.
 #[test]
 fn a_flushed_table_goes_on_like_an_uploaded_one() -> Result<()> {
-    let mut bench = Bench::new(0.01, false)?;
+    let mut bench = Bench::new(0.01, false, false)?;
     let gpu = bench.gpu.clone();
     let steps = |bench: &mut Bench, range: std::ops::Range<u64>, batches: usize| {
         let mut random = Random(range.start + 1);

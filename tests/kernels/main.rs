@@ -2,6 +2,7 @@
 
 mod field_chunks;
 mod first_weights;
+mod half_copy;
 mod harness;
 mod layer;
 mod lazy_table;

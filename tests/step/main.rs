@@ -5,6 +5,8 @@
 mod reference;
 
 mod golden_step;
+#[path = "../kernels/half_copy.rs"]
+mod half_copy;
 mod own_priors;
 mod rig;
 mod training_step;

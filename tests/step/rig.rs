@@ -1,5 +1,6 @@
 //! A trainer on the device beside the twin of its configuration, and the way of numbers between the two.
 
+use crate::half_copy::cut;
 use crate::reference::background::{Background, FieldConfig};
 use crate::reference::batch::{Density, Draws, Rays, Scale, Stage, Step, StepConfig, Tangent};
 use crate::reference::hash_grid::{Grid, Level};
@@ -130,6 +131,9 @@ impl Rig {
             let values = params
                 .get_mut(&span.name)
                 .unwrap_or_else(|| panic!("the twin has no span {}", span.name));
+            if span.name == "surface.table" && self.config.hash.half {
+                values.iter_mut().for_each(|x| *x = cut(*x));
+            }
             let mut rounded: Vec<f32> = values.iter().map(|&x| x as f32).collect();
             *values = rounded.iter().map(|&x| f64::from(x)).collect();
             if let Some(order) = self.column_order(&span.name) {
@@ -140,6 +144,7 @@ impl Rig {
             self.gpu.upload(block.values(), span.first, &rounded)?;
         }
         assert_eq!(params.len(), spans().count(), "spans of both sides");
+        block.refresh_copy(&self.gpu)?;
         Ok(())
     }
 

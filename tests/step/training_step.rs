@@ -1,5 +1,6 @@
 //! `Trainer::step` in the middle of a run, in several configurations, against the twin given the same rays, draws and parameters.
 
+use crate::half_copy::assert_copy;
 use crate::reference::batch::{Now, Outcome, Step, StepConfig};
 use crate::reference::losses;
 use crate::reference::optimizer::Adam;
@@ -203,6 +204,16 @@ fn outdoors_with_a_background_field_and_appearance_codes() -> Result<()> {
     check(config, RegionShape::Sphere, 9, usual())
 }
 
+/// The twin has the table that look-ups read: one of numbers that float16 has. One stage's table is updated whole, the other's in part.
+#[test]
+fn both_stages_with_a_table_copied_in_float16() -> Result<()> {
+    for mut config in [preset("outdoor-tiny"), second("outdoor-tiny")] {
+        config.hash.half = true;
+        check(config, RegionShape::Sphere, 9, usual())?;
+    }
+    Ok(())
+}
+
 /// Large enough for a table of which a step leaves a part alone.
 #[test]
 fn outdoors_with_a_table_that_is_updated_in_part() -> Result<()> {
@@ -383,7 +394,21 @@ fn check(config: Config, shape: RegionShape, seed: u64, options: GpuOptions) -> 
     check_losses(&twin, &losses, &named);
     check_crossing(&rig, &twin, &losses);
     check_update(&rig, &GradientRange::of(&step), &params, [&m0, &v0], &now)?;
+    check_copy(&rig)?;
     rig.check_device()
+}
+
+/// The updated table's copy, where it has one.
+fn check_copy(rig: &Rig) -> Result<()> {
+    let block = &rig.trainer.model().params;
+    let Some(copy) = block.copy() else {
+        return Ok(());
+    };
+    let table = block.span("surface.table").expect("the table");
+    let values = rig.gpu.download(block.values(), table.first, table.len())?;
+    let values: Vec<f64> = values.into_iter().map(f64::from).collect();
+    assert_copy(&rig.gpu.download(copy, 0, copy.len())?, &values);
+    Ok(())
 }
 
 /// Rays meet the region where the twin's do.
