@@ -2,11 +2,13 @@
 // Hash grid, hidden layer and first output of a field in one pass, one point per invocation:
 //   z = [x, e(x)],  u = W₁z + b₁,  h = σ(u),  out = w₂·h + b₂.
 // The SDF and its taps, the proposal densities and the background density are all this kernel.
-// In two launches, PART 1 with a slice per level and then PART 2, it suits devices whose caches hold one level but not all of them.
+// In two launches, PART 1 with a slice per level and then PART 2, it suits devices whose caches hold one level but not all of them; there, few
+// workgroups go over all points.
 #include "lib/prelude.glsl"
 #include "lib/hash_grid.glsl"
 #include "lib/field.glsl"
 #include "lib/look_up.glsl"
+#include "lib/read_through.glsl"
 
 // 1: the first n_hidden points have further heads; 0: none at hand has. (With 1 lavapipe branches per lane at every store of h: a launch for
 // those that have and one for the others is faster.)
@@ -39,35 +41,48 @@ void keep(vec3 d, uint row, uint feature, uint point) {
     [[unroll]] for (uint i = 0u; i < 3u; ++i) derivatives.at[derivative_row(row + i, feature) * n + point] = d[i];
 }
 
+// A level's part of a point's encoding.
+void encode(Level level, uint l, uint point) {
+    vec3 x = vector_at(points, point, n);
+    Cell cell = cell_of(level, x);
+    uint entries[8];
+    [[unroll]] for (uint corner = 0u; corner < 8u; ++corner) entries[corner] = corner_entry(level, cell, corner);
+    [[unroll]] for (uint k = 0u; k < PAIRS; ++k) {
+        vec2 corners[8];
+        [[unroll]] for (uint corner = 0u; corner < 8u; ++corner) corners[corner] = look_up(table, entries[corner], k);
+        Interpolation e = interpolate(corners, cell.weight);
+        [[unroll]] for (uint f = 2u * k; f < min(2u * k + 2u, FEATURES); ++f) {
+            uint feature = l * FEATURES + f;
+            inputs.at[(COORDINATES + feature) * n + point] = e.value[f % 2u];
+            if (KEPT >= 1u) keep(slope_of(level, e, f % 2u), 0u, feature, point);
+            if (KEPT >= 2u) keep(mixed_of(level, e, f % 2u), 3u, feature, point);
+        }
+    }
+    if (COORDINATES != 0u && l == 0u) set_vector(inputs, point, n, x);
+}
+
+// The same of this workgroup's share of the points.
+void encode_level() {
+    uint l = level_of_slice(LEVELS), groups = gl_NumWorkGroups.x * gl_NumWorkGroups.y;
+    Level level = levels.at[l];
+    uint words_of_entry = HALF != 0u ? FEATURES / 2u : FEATURES;
+    uint n_words = level.entries * words_of_entry;
+    if (read_through(table, level.offset * words_of_entry, n_words, (end - begin) / groups) > n_words) return;  // never
+    for (uint point = begin + item(); point < end; point += groups * LOCAL_SIZE) encode(level, l, point);
+}
+
 void main() {
+    if (PART == 1u) {
+        encode_level();
+        return;
+    }
     // In straight-line code, invocations past the end do the last point once more, and write what its own invocation writes.
     uint point = begin + item();
     if (STRAIGHT != 0u) point = min(point, end - 1u);
     else if (point >= end) return;
-    vec3 x = vector_at(points, point, n);
-    if (PART != 2u) {
-        uint first_level = PART == 1u ? level_of_slice(LEVELS) : 0u;
-        uint end_level = PART == 1u ? first_level + 1u : LEVELS;
-        if (COORDINATES != 0u && first_level == 0u) set_vector(inputs, point, n, x);
-        for (uint l = first_level; l < end_level; ++l) {
-            Level level = levels.at[l];
-            Cell cell = cell_of(level, x);
-            uint entries[8];
-            [[unroll]] for (uint corner = 0u; corner < 8u; ++corner) entries[corner] = corner_entry(level, cell, corner);
-            [[unroll]] for (uint k = 0u; k < PAIRS; ++k) {
-                vec2 corners[8];
-                [[unroll]] for (uint corner = 0u; corner < 8u; ++corner) corners[corner] = look_up(table, entries[corner], k);
-                Interpolation e = interpolate(corners, cell.weight);
-                [[unroll]] for (uint f = 2u * k; f < min(2u * k + 2u, FEATURES); ++f) {
-                    uint feature = l * FEATURES + f;
-                    inputs.at[(COORDINATES + feature) * n + point] = e.value[f % 2u];
-                    if (KEPT >= 1u) keep(slope_of(level, e, f % 2u), 0u, feature, point);
-                    if (KEPT >= 2u) keep(mixed_of(level, e, f % 2u), 3u, feature, point);
-                }
-            }
-        }
+    if (PART == 0u) {
+        for (uint l = 0u; l < LEVELS; ++l) encode(levels.at[l], l, point);
     }
-    if (PART == 1u) return;
     // Copied to locals before the loop: lavapipe bounds-checks every read of a push constant by a branch, behind which it then computes the
     // sums that are used there, while their products wait on the stack.
     F32s hidden_weight = hidden_weight, hidden_bias = hidden_bias, head_weight = head_weight;

@@ -1,11 +1,12 @@
 #version 460
 // hash_grid_backward for devices with few cores and slow atomics: a subgroup owns a level (the slice), walks over all points, and its
-// eight lanes are the eight corners. Nobody else adds to that level, so plain loads and stores do.
+// eight lanes are the eight corners. Nobody else adds to that level, so plain loads and stores do. Small levels are in its cache by then.
 #define LOCAL_SIZE 8
 #include "lib/prelude.glsl"
 #include "lib/hash_grid.glsl"
 #include "lib/scatter.glsl"
 #include "lib/entry.glsl"
+#include "lib/read_through.glsl"
 
 const uint POINTS = 4u;  // per turn of the loop
 
@@ -29,6 +30,8 @@ void scatter(Level level, uint l, uint point) {
 void main() {
     uint l = level_of_slice(LEVELS);
     Level level = levels.at[l];
+    uint n_words = level.entries * FEATURES * SUM_WORDS, first_word = level.offset * FEATURES * SUM_WORDS;
+    if (read_through(U32s(uvec2(d_table)), first_word, n_words, end - begin) > n_words) return;  // never
     for (uint first = begin; first < end; first += POINTS) {
         [[unroll]] for (uint k = 0u; k < POINTS; ++k) {
             if (first + k < end) scatter(level, l, first + k);

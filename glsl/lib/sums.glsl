@@ -2,6 +2,7 @@
 // integers in units of 2⁻⁴⁸, which do not: up to ±32768, 3.6e-15 apart. `add_alone` is for who knows that nobody else adds there.
 #ifdef DETERMINISTIC
 layout(buffer_reference, scalar, buffer_reference_align = 8) buffer SumsMut { int64_t at[]; };
+const uint SUM_WORDS = 2u;
 const float UNITS = 281474976710656.0;
 
 void add(SumsMut p, uint i, float v) { atomicAdd(p.at[i], int64_t(v * UNITS)); }
@@ -25,6 +26,7 @@ void add_pair_alone(SumsMut p, uint i, vec2 v) {
 }
 #else
 layout(buffer_reference, scalar, buffer_reference_align = 4) buffer SumsMut { float at[]; };
+const uint SUM_WORDS = 1u;
 
 F32sMut floats(SumsMut p) { return F32sMut(uvec2(p)); }
 

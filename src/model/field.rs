@@ -15,6 +15,9 @@ use std::ops::Range;
 /// Points that go back through a field at once: the memory that this takes is theirs alone.
 const AT_ONCE: u32 = 1 << 16;
 
+/// Workgroups that encode a level of all points on devices with few cores, each of which reads it into its core's cache first.
+const ENCODERS: u32 = 2;
+
 /// What fixes a field's kernels.
 #[derive(Clone, Copy, Debug)]
 pub struct FieldShape {
@@ -81,6 +84,7 @@ pub struct Field {
     apart: bool,
     /// The network's backward pass ends before its first layer, whose inputs' gradients the layer itself computes, all of them.
     by_matrices: bool,
+    few_cores: bool,
     backward: Network<field_backward::Args>,
     scatter: Scatter,
     hidden_layer: Layer,
@@ -387,6 +391,7 @@ impl Field {
             },
             apart: few_cores || by_matrices,
             by_matrices,
+            few_cores,
             backward: Network {
                 kernel: backward(1)?,
                 headless: match few_cores {
@@ -511,11 +516,17 @@ impl Field {
             flops *= 4.0;
             bytes += self.derivative_bytes(self.kept());
         }
-        let work = Work::items(u64::from(buffers.n))
+        let kernel = keeping.unwrap_or(&self.encoding);
+        let groups = match self.few_cores {
+            true => ENCODERS,
+            false => buffers.n.div_ceil(kernel.local_size()),
+        };
+        let of_group = f64::from(buffers.n) / f64::from(groups) / levels;
+        let work = Work::groups(groups.into())
             .slices(self.shape.grid.levels)
-            .flops(flops / levels)
-            .bytes(bytes / levels);
-        rec.run(keeping.unwrap_or(&self.encoding), work, args);
+            .flops(flops * of_group)
+            .bytes(bytes * of_group);
+        rec.run(kernel, work, args);
     }
 
     fn forward_args(
