@@ -1,8 +1,10 @@
 #version 460
-// AdamW, two parameters per invocation. Parameters without gradient decay and move on by their momentum like all others. A step whose
+// AdamW, two parameters in each turn of an invocation. Parameters without gradient decay and move on by their momentum like all others. A step whose
 // loss is not finite changes nothing.
 #include "lib/prelude.glsl"
 #include "lib/update_pair.glsl"
+
+layout(constant_id = 0) const uint TURNS = 1;
 
 layout(push_constant, scalar) uniform Args {
     F32sMut params;        // [n] updated in place
@@ -21,8 +23,16 @@ layout(push_constant, scalar) uniform Args {
 };
 
 void main() {
-    uint i = 2u * item();
-    if (i >= n) return;
+    // Copied to locals before the loop, as in field_forward.
+    F32sMut params = params, first_moment = first_moment, second_moment = second_moment;
+    U32sMut halves = halves;
+    SumsMut grads = grads;
+    uint n = n;
+    bool bad = bad_step.at[0] != 0u;
     Rates rates = Rates(rate, decay, correction, one_minus_beta1, one_minus_beta2, epsilon);
-    update_pair(params, halves, grads, first_moment, second_moment, i, bad_step.at[0] != 0u, rates);
+    uint pair = first_item(TURNS);
+    for (uint turn = 0u; turn < TURNS; ++turn) {
+        if (2u * pair < n) update_pair(params, halves, grads, first_moment, second_moment, 2u * pair, bad, rates);
+        pair += items_abreast();
+    }
 }

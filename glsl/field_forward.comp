@@ -68,7 +68,12 @@ void encode_level() {
     uint words_of_entry = HALF != 0u ? FEATURES / 2u : FEATURES;
     uint n_words = level.entries * words_of_entry;
     if (read_through(table, level.offset * words_of_entry, n_words, (end - begin) / groups) > n_words) return;  // never
-    for (uint point = begin + item(); point < end; point += groups * LOCAL_SIZE) encode(level, l, point);
+    uint turns = (end - begin + groups * LOCAL_SIZE - 1u) / (groups * LOCAL_SIZE);
+    uint point = begin + first_item(turns);
+    for (uint turn = 0u; turn < turns; ++turn) {
+        if (point < end) encode(level, l, point);
+        point += items_abreast();
+    }
 }
 
 void main() {

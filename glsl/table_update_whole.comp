@@ -28,22 +28,23 @@ layout(push_constant, scalar) uniform Args {
     float epsilon;
 };
 
-const uint AT_ONCE = 4u;
-
 void main() {
     uint l = slice();
     uint whole = uses.at[l].whole;
     if (whole == 0u) return;
     Level level = levels.at[l];
-    uint n_params = level.entries * FEATURES, first = group() * LOCAL_SIZE * TURNS + gl_LocalInvocationID.x;
+    // Copied to locals before the loop, as in field_forward.
+    F32sMut table = table, first_moment = first_moment, second_moment = second_moment;
+    U32sMut halves = halves;
+    SumsMut grads = grads;
+    uint n_pairs = level.entries * FEATURES / 2u;  // levels have an even number of entries
     bool bad = bad_step.at[0] != 0u;
     Rates rates = Rates(rate, decay, correction, one_minus_beta1, one_minus_beta2, epsilon);
-    for (uint turn = 0u; turn < TURNS; turn += AT_ONCE) {
-        [[unroll]] for (uint k = 0u; k < AT_ONCE; ++k) {
-            uint j = 2u * (first + (turn + k) * LOCAL_SIZE);
-            // Levels have an even number of entries.
-            if (j < n_params) update_pair(table, halves, grads, first_moment, second_moment, level.offset * FEATURES + j, bad, rates);
-        }
+    uint pair = first_item(TURNS);
+    for (uint turn = 0u; turn < TURNS; ++turn) {
+        uint i = level.offset * FEATURES + 2u * pair;
+        if (pair < n_pairs) update_pair(table, halves, grads, first_moment, second_moment, i, bad, rates);
+        pair += items_abreast();
     }
     // The next step marks this level again, and needs its stamps.
     if (whole == 1u) {

@@ -7,11 +7,11 @@ const uint LINE = 16u;             // words
 const uint MOST_WORDS = 1u << 18;  // more than a core's cache holds would be gone before it is asked for
 const uint LINES_A_POINT = 16u;    // are read through in the time that one point waits
 
-// For so many points, n words from a first one on. Returns how many lines do not begin with 0, for one reason: what nobody asks for the
-// compiler does not read. It is at most n.
+// For so many points, n words from a first one on; by the first subgroup, since a software device begins with the next when that one has ended.
+// Returns how many lines do not begin with 0, at most n, for one reason: what nobody asks for the compiler does not read.
 uint read_through(U32s words, uint first, uint n, uint points) {
     uint filled = 0u;
-    if (n > MOST_WORDS || points * LINES_A_POINT < n / LINE) return filled;
-    for (uint i = LINE * gl_LocalInvocationID.x; i < n; i += LINE * gl_WorkGroupSize.x) filled += min(words.at[first + i], 1u);
+    if (gl_SubgroupID > 0u || n > MOST_WORDS || points * LINES_A_POINT < n / LINE) return filled;
+    for (uint i = LINE * gl_SubgroupInvocationID; i < n; i += LINE * gl_SubgroupSize) filled += min(words.at[first + i], 1u);
     return filled;
 }

@@ -11,6 +11,8 @@ use crate::model::{Group, Model, Rates};
 /// The optimiser of all parameter groups.
 pub struct Adam {
     config: OptimizerConfig,
+    /// Pairs of parameters of an invocation.
+    turns: u64,
     kernel: Kernel<adam::Args>,
     /// For a table that has a copy in float16.
     with_copy: Kernel<adam::Args>,
@@ -19,10 +21,12 @@ pub struct Adam {
 impl Adam {
     /// The optimiser of a configuration.
     pub fn new(gpu: &Gpu, config: &Config) -> Result<Adam> {
+        let turns = if gpu.info().few_cores { 32 } else { 1 };
         Ok(Adam {
+            turns: turns.into(),
             config: config.optimizer.clone(),
-            kernel: gpu.kernel(adam::Shape::default())?,
-            with_copy: gpu.kernel(adam::Shape { half: 1 })?,
+            kernel: gpu.kernel(adam::Shape { half: 0, turns })?,
+            with_copy: gpu.kernel(adam::Shape { half: 1, turns })?,
         })
     }
 
@@ -73,11 +77,11 @@ impl Adam {
                 0 => &self.kernel,
                 _ => &self.with_copy,
             };
-            rec.run(
-                kernel,
-                Work::items(n.div_ceil(2)).flops(30.0).bytes(64.0),
-                args,
-            );
+            let of_group = 2 * self.turns * u64::from(kernel.local_size());
+            let work = Work::groups(n.div_ceil(of_group))
+                .flops(15.0 * of_group as f64)
+                .bytes(32.0 * of_group as f64);
+            rec.run(kernel, work, args);
         }
     }
 }
