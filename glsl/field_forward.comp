@@ -67,8 +67,9 @@ void encode_level() {
     Level level = levels.at[l];
     uint words_of_entry = HALF != 0u ? FEATURES / 2u : FEATURES;
     uint n_words = level.entries * words_of_entry;
-    if (read_through(table, level.offset * words_of_entry, n_words, (end - begin) / groups) > n_words) return;  // never
     uint turns = (end - begin + groups * LOCAL_SIZE - 1u) / (groups * LOCAL_SIZE);
+    // Where there are many workgroups, they have one turn each, and share a cache.
+    if (turns > 1u && read_through(table, level.offset * words_of_entry, n_words, turns * LOCAL_SIZE) > n_words) return;  // never
     uint point = begin + first_item(turns);
     for (uint turn = 0u; turn < turns; ++turn) {
         if (point < end) encode(level, l, point);

@@ -60,8 +60,8 @@ pub(super) enum Frame {
 }
 
 /// Cells are left out where the signed distance says that the surface is far, supposing that it is nowhere steeper than this. Training
-/// holds slopes near 1; whether it held is measured, and said.
-const STEEPEST: f64 = 4.0;
+/// holds slopes near 1, up to 8 here and there; whether it held is measured, and said.
+const STEEPEST: f64 = 10.0;
 
 pub(super) fn run(args: &MeshArgs, context: &Context) -> anyhow::Result<()> {
     let written = take(args, context)?.ok_or_else(|| no_surface(&args.run))?;
