@@ -45,12 +45,21 @@ fn sphere(radius: f64) -> Region {
 
 #[test]
 fn a_restored_run_takes_the_same_next_step() {
+    restored_takes_the_same_next_step(&of_every_kind());
+}
+
+#[test]
+fn a_restored_run_looks_up_its_own_table_in_float16() {
+    let with_copy = of_every_kind().with_assignment("hash.half=true").unwrap();
+    restored_takes_the_same_next_step(&with_copy);
+}
+
+fn restored_takes_the_same_next_step(config: &Config) {
     let folder = tempfile::tempdir().unwrap();
     let scene = scene(folder.path());
     let region = sphere(1.1);
-    let config = of_every_kind();
     let gpu = Gpu::new(&GpuOptions::default()).unwrap();
-    let mut first = Trainer::new(&gpu, &scene, &region, &config).unwrap();
+    let mut first = Trainer::new(&gpu, &scene, &region, config).unwrap();
     for _ in 0..6 {
         first.step().unwrap();
     }
@@ -63,7 +72,7 @@ fn a_restored_run_takes_the_same_next_step() {
         "it has trained"
     );
 
-    let mut second = Trainer::new(&gpu, &scene, &region, &config).unwrap();
+    let mut second = Trainer::new(&gpu, &scene, &region, config).unwrap();
     second.restore(&begun_anew).unwrap();
     assert_eq!(second.steps_done(), 6);
     let again = second.save(&folder.path().join("second")).unwrap();

@@ -356,6 +356,20 @@ impl Params {
     pub fn values(&self) -> &Buffer<f32> {
         &self.values
     }
+    pub fn grads(&self) -> &Buffer<f32> {
+        &self.learning().grads
+    }
+    pub fn first_moment(&self) -> &Buffer<f32> {
+        &self.learning().first_moment
+    }
+    pub fn second_moment(&self) -> &Buffer<f32> {
+        &self.learning().second_moment
+    }
+
+    fn learning(&self) -> &Learning {
+        let learning = self.learning.as_ref();
+        learning.expect("a model that was built to be trained")
+    }
 
     /// What look-ups read of the table at this element: its values, or their copy in float16.
     pub fn table(&self, first: u64) -> Ptr<u32> {
@@ -387,21 +401,6 @@ impl Params {
             Ok(())
         })?;
         Ok(())
-    }
-
-    pub fn grads(&self) -> &Buffer<f32> {
-        &self.learning().grads
-    }
-    pub fn first_moment(&self) -> &Buffer<f32> {
-        &self.learning().first_moment
-    }
-    pub fn second_moment(&self) -> &Buffer<f32> {
-        &self.learning().second_moment
-    }
-
-    fn learning(&self) -> &Learning {
-        let learning = self.learning.as_ref();
-        learning.expect("a model that was built to be trained")
     }
 
     /// Refreshes the effective weights from v and g. `released_columns`: of matrices with release, those that act.
