@@ -27,8 +27,11 @@ const CORE_ONLY: &str = "CORE_ONLY";
 const DETERMINISTIC: &str = "DETERMINISTIC";
 /// What the file of a kernel's second form has in its name: the same by cooperative matrices, `<stem>.cooperative.comp`.
 const COOPERATIVE: &str = "cooperative";
-/// Specialisation constants from here on are what cooperative matrices are made of; the device says it (lib/cooperative.glsl).
-const MATRIX_CONSTANTS: u32 = 100;
+/// Specialisation constants from here on are the device's: what it multiplies, and how many lanes read at once (lib/cooperative.glsl,
+/// lib/abreast.glsl).
+const DEVICE_CONSTANTS: u32 = 100;
+/// The constant of kernels that read items abreast.
+const LANES: &str = "LANES";
 /// The pointer type of gradients (lib/sums.glsl).
 const SUMS: &str = "SumsMut ";
 /// Every implementation has this much, and lavapipe of 2022 no more.
@@ -139,7 +142,7 @@ fn kernel(
         Some(path) => {
             let (source, second) = form(glsl, path, out)?;
             let foreign = second.constants.iter().find(|constant| {
-                constant.id < MATRIX_CONSTANTS && !module.constants.contains(constant)
+                constant.id < DEVICE_CONSTANTS && !module.constants.contains(constant)
             });
             if second.args != module.args || foreign.is_some() {
                 return Err(format!(
@@ -380,7 +383,11 @@ fn rust_module(
     );
     let mut defaults = String::new();
     let mut bits = String::new();
-    for constant in &module.constants {
+    let of_shape = module
+        .constants
+        .iter()
+        .filter(|constant| constant.id < DEVICE_CONSTANTS);
+    for constant in of_shape.clone() {
         if constant.name.is_empty() {
             return Err(format!(
                 "specialisation constant {} has no name",
@@ -412,7 +419,7 @@ fn rust_module(
         w,
         "}}\n{derivable}impl Default for Shape {{ fn default() -> Self {{ Self {{ {defaults} }} }} }}"
     );
-    let count = module.constants.len();
+    let count = of_shape.count();
     let _ = writeln!(
         w,
         "impl crate::gpu::KernelShape for Shape {{\ntype Args = Args;"
@@ -483,11 +490,15 @@ fn kernel_module(stem: &str, source: &Source, module: &Module, cooperative: &str
     format!(
         "crate::gpu::KernelModule {{ name: {stem:?}, local_size: {:?}, spirv: {}, spirv_of_core: {fallback}, \
          deterministic_spirv: {deterministic}, cooperative: {cooperative}, matrix_tile: {matrix_tile}, pointers: &[{pointers}], indirect_reads: {}, \
-         indirect_writes: {} }}",
+         indirect_writes: {}, lanes: {} }}",
         module.local_size,
         embed(""),
         module.indirect_reads,
-        module.indirect_writes
+        module.indirect_writes,
+        module
+            .constants
+            .iter()
+            .any(|constant| constant.name == LANES)
     )
 }
 

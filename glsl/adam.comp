@@ -27,12 +27,12 @@ void main() {
     F32sMut params = params, first_moment = first_moment, second_moment = second_moment;
     U32sMut halves = halves;
     SumsMut grads = grads;
-    uint n = n;
+    uint n_pairs = (n + 1u) / 2u;
     bool bad = bad_step.at[0] != 0u;
     Rates rates = Rates(rate, decay, correction, one_minus_beta1, one_minus_beta2, epsilon);
-    uint pair = first_item(TURNS);
+    uint first = first_of_subgroup(TURNS);
     for (uint turn = 0u; turn < TURNS; ++turn) {
-        if (2u * pair < n) update_pair(params, halves, grads, first_moment, second_moment, 2u * pair, bad, rates);
-        pair += items_abreast();
+        update_pair(params, halves, grads, first_moment, second_moment, 0u, item_from(first, n_pairs), bad, rates);
+        first += items_abreast();
     }
 }

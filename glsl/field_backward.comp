@@ -46,20 +46,19 @@ void main() {
     F32sMut d_preactivation = d_preactivation, steepness = steepness;
     SumsMut d_head_weight = d_head_weight;
     uint n_hidden = n_hidden, m = m;
-    uint point = begin + item();
-    // Invocations past the end stay for the subgroup's sums, to which they add nothing; they do the first point once more, and write what
-    // its own invocation writes: a software device pays as much for a branch around a store as for the store. (Summing up in shared
-    // memory first would halve its speed, too: a barrier costs more there than an atomic add.)
-    bool inside = point < end;
-    uint p = inside ? point : begin;
-    uint q = p - first;
-    load_input(inputs, n, p);
+    // Invocations past the end stay for the subgroup's sums, to which they add nothing, and write as all others do: a software device pays
+    // as much for a branch around a store as for the store. (Summing up in shared memory first would halve its speed, too: a barrier costs
+    // more there than an atomic add.)
+    Item point = item_of(begin, end);
+    Item kept = counted_from(first, point);  // in scratch memory
+    uint q = kept.at;
+    load_input(inputs, n, point);
     float z_dot[TANGENTS];
     if (SECOND_ORDER != 0u) {
-        [[unroll]] for (uint i = 0u; i < TANGENTS; ++i) z_dot[i] = tangents.at[i * m + q];
+        [[unroll]] for (uint i = 0u; i < TANGENTS; ++i) z_dot[i] = number_of(tangents, i * m, kept);
     }
-    float d_out = d_first.at[p];
-    bool has_heads = HEADS != 0u && p < n_hidden;
+    float d_out = number_of(d_first, 0u, point);
+    bool has_heads = HEADS == 2u || HEADS == 1u && point.at < n_hidden;
     float d_z[OUT_INPUTS];
     [[unroll]] for (uint i = 0u; i < OUT_INPUTS; ++i) d_z[i] = 0.0;
 
@@ -83,7 +82,7 @@ void main() {
             float slope = activation_derivative(u[t]);
             float d_w2 = d_out * activation(u[t]);
             float d_h = d_out * w2;
-            if (has_heads) d_h += d_hidden.at[neuron * n_hidden + p];
+            if (has_heads) d_h += HEADS == 2u ? number_of(d_hidden, neuron * n_hidden, point) : d_hidden.at[neuron * n_hidden + point.at];
             float d_u = d_h * slope;
             if (SECOND_ORDER != 0u) {
                 d_w2 += s_dot[t] * slope;
@@ -93,7 +92,7 @@ void main() {
             u[t] = d_u;
             d_preactivation.at[neuron * m + q] = d_u;
             // A lane for each neuron's sum, so that one access adds as many as there are lanes.
-            d_w2 = subgroupAdd(inside ? d_w2 : 0.0);
+            d_w2 = subgroupAdd(point.again ? 0.0 : d_w2);
             uint lane = t % gl_SubgroupSize;
             if (gl_SubgroupInvocationID == lane) d_w2_of_lane = d_w2;
             if (lane == gl_SubgroupSize - 1u || t == TILE - 1u) {
@@ -108,7 +107,7 @@ void main() {
     } while (first_neuron < neurons);
     [[unroll]] for (uint i = 0u; i < OUT_INPUTS; ++i) d_inputs.at[i * m + q] = d_z[i];
     if (BIAS != 0u) {
-        float d_b2 = subgroupAdd(inside ? d_out : 0.0);
+        float d_b2 = subgroupAdd(point.again ? 0.0 : d_out);
         if (subgroupElect()) add(d_head_bias, 0u, d_b2);
     }
 }

@@ -10,8 +10,8 @@
 #include "lib/look_up.glsl"
 #include "lib/read_through.glsl"
 
-// 1: the first n_hidden points have further heads; 0: none at hand has. (With 1 lavapipe branches per lane at every store of h: a launch for
-// those that have and one for the others is faster.)
+// Further heads: 0 none of the points of this launch have any, 1 the first n_hidden have, 2 all have. (With 1 lavapipe branches per lane at
+// every store of h: a launch for those that have and one for the others is faster.)
 layout(constant_id = 7) const uint HEADS = 1;
 layout(constant_id = 8) const uint PART = 0;      // 0 everything, 1 the encoding of one level per slice, 2 the network
 layout(constant_id = 9) const uint STRAIGHT = 0;
@@ -42,8 +42,9 @@ void keep(vec3 d, uint row, uint feature, uint point) {
 }
 
 // A level's part of a point's encoding.
-void encode(Level level, uint l, uint point) {
-    vec3 x = vector_at(points, point, n);
+void encode(Level level, uint l, Item item) {
+    uint point = item.at;
+    vec3 x = vector_of(points, n, item);
     Cell cell = cell_of(level, x);
     uint entries[8];
     [[unroll]] for (uint corner = 0u; corner < 8u; ++corner) entries[corner] = corner_entry(level, cell, corner);
@@ -70,10 +71,10 @@ void encode_level() {
     uint turns = (end - begin + groups * LOCAL_SIZE - 1u) / (groups * LOCAL_SIZE);
     // Where there are many workgroups, they have one turn each, and share a cache.
     if (turns > 1u && read_through(table, level.offset * words_of_entry, n_words, turns * LOCAL_SIZE) > n_words) return;  // never
-    uint point = begin + first_item(turns);
+    uint first = begin + first_of_subgroup(turns);
     for (uint turn = 0u; turn < turns; ++turn) {
-        if (point < end) encode(level, l, point);
-        point += items_abreast();
+        encode(level, l, item_from(first, end));
+        first += items_abreast();
     }
 }
 
@@ -82,10 +83,7 @@ void main() {
         encode_level();
         return;
     }
-    // In straight-line code, invocations past the end do the last point once more, and write what its own invocation writes.
-    uint point = begin + item();
-    if (STRAIGHT != 0u) point = min(point, end - 1u);
-    else if (point >= end) return;
+    Item point = item_of(begin, end);
     if (PART == 0u) {
         for (uint l = 0u; l < LEVELS; ++l) encode(levels.at[l], l, point);
     }
@@ -105,9 +103,9 @@ void main() {
         [[unroll]] for (uint t = 0u; t < TILE; ++t) {
             float h = activation(u[t]);
             sum = fma(head_weight.at[first_neuron + t], h, sum);
-            if (HEADS != 0u && point < n_hidden) hidden.at[(first_neuron + t) * n_hidden + point] = h;
+            if (HEADS != 0u && (HEADS == 2u || point.at < n_hidden)) hidden.at[(first_neuron + t) * n_hidden + point.at] = h;
         }
         first_neuron += TILE;
     } while (first_neuron < neurons);
-    first.at[point] = sum;
+    first.at[point.at] = sum;
 }

@@ -26,11 +26,9 @@ layout(push_constant, scalar) uniform Args {
 };
 
 void main() {
-    // In straight-line code, invocations past the end do the last point once more, and write what its own invocation writes.
-    uint point = item();
-    if (STRAIGHT != 0u) point = min(point, n - 1u);
-    else if (point >= n) return;
-    load_input(inputs, n, point);
+    Item at_hand = item_of(0u, n);
+    uint point = at_hand.at;
+    load_input(inputs, n, at_hand);
     float a[INPUTS];
     [[unroll]] for (uint i = 0u; i < INPUTS; ++i) a[i] = 0.0;
     uint neurons = turns(HIDDEN, n);
@@ -50,7 +48,7 @@ void main() {
     if (KEPT != 0u) {
         [[unroll]] for (uint feature = 0u; feature < LEVELS * FEATURES; ++feature) {
             [[unroll]] for (uint axis = 0u; axis < 3u; ++axis) {
-                g[axis] = fma(a[COORDINATES + feature], derivatives.at[derivative_row(axis, feature) * n + point], g[axis]);
+                g[axis] = fma(a[COORDINATES + feature], number_of(derivatives, derivative_row(axis, feature) * n, at_hand), g[axis]);
             }
         }
         set_vector(gradient, point, n, g);

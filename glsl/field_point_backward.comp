@@ -24,17 +24,19 @@ layout(push_constant, scalar) uniform Args {
 };
 
 void main() {
-    uint point = begin + item(), count = end - begin;
-    if (point >= end) return;
-    vec3 x = vector_at(points, point, n);
-    vec3 v = vector_at(d_gradient, point, n);
-    vec3 d_x = COORDINATES != 0u ? vector_at(d_inputs, item(), count) : vec3(0.0);
-    for (uint l = 0u; l < LEVELS; ++l) {
+    Item point = item_of(begin, end);
+    Item kept = counted_from(begin, point);  // in scratch memory
+    uint count = end - begin;
+    vec3 x = vector_of(points, n, point);
+    vec3 v = vector_of(d_gradient, n, point);
+    vec3 d_x = COORDINATES != 0u ? vector_of(d_inputs, count, kept) : vec3(0.0);
+    for (uint turn = 0u; turn < LEVELS; ++turn) {
+        uint l = min(turn, LEVELS - 1u);  // (lib/abreast.glsl)
         if (KEPT != 0u) {
             [[unroll]] for (uint f = 0u; f < FEATURES; ++f) {
                 uint feature = l * FEATURES + f, row = COORDINATES + feature;
-                vec3 slope = kept_derivatives(derivatives, 0u, feature, point, n), mixed = kept_derivatives(derivatives, 3u, feature, point, n);
-                d_x += d_inputs.at[row * count + item()] * slope + slopes.at[row * n + point] * curvature_along(mixed, v);
+                vec3 slope = kept_derivatives(derivatives, 0u, feature, n, point), mixed = kept_derivatives(derivatives, 3u, feature, n, point);
+                d_x += number_of(d_inputs, row * count, kept) * slope + number_of(slopes, row * n, point) * curvature_along(mixed, v);
             }
             continue;
         }
@@ -44,8 +46,8 @@ void main() {
         d_e[PAIRS - 1u] = slope[PAIRS - 1u] = vec2(0.0);
         [[unroll]] for (uint f = 0u; f < FEATURES; ++f) {
             uint row = COORDINATES + l * FEATURES + f;
-            d_e[f / 2u][f % 2u] = d_inputs.at[row * count + item()];
-            slope[f / 2u][f % 2u] = slopes.at[row * n + point];
+            d_e[f / 2u][f % 2u] = number_of(d_inputs, row * count, kept);
+            slope[f / 2u][f % 2u] = number_of(slopes, row * n, point);
         }
         vec2 corners[8];
         [[unroll]] for (uint corner = 0u; corner < 8u; ++corner) {
@@ -59,5 +61,5 @@ void main() {
         Interpolation e = interpolate(corners, cell.weight);
         d_x += slope_of(level, e, 0u) + curvature_along(mixed_of(level, e, 1u), v);
     }
-    set_vector(d_points, point, n, d_x);
+    set_vector(d_points, point.at, n, d_x);
 }

@@ -21,20 +21,20 @@ layout(push_constant, scalar) uniform Args {
 };
 
 void main() {
-    uint point = begin + item(), count = end - begin;
-    if (point >= end) return;
-    vec3 v = vector_at(d_gradient, point, n);
+    Item point = item_of(begin, end);
+    uint q = point.at - begin, count = end - begin;
+    vec3 v = vector_of(d_gradient, n, point);
     uint l = level_of_slice(LEVELS);
-    if (COORDINATES != 0u && l == 0u) set_vector(tangents, item(), count, v);
+    if (COORDINATES != 0u && l == 0u) set_vector(tangents, q, count, v);
     if (KEPT != 0u) {
         [[unroll]] for (uint f = 0u; f < FEATURES; ++f) {
             uint feature = l * FEATURES + f;
-            vec3 slope = kept_derivatives(derivatives, 0u, feature, point, n);
-            tangents.at[(COORDINATES + feature) * count + item()] = dot(slope, v);
+            vec3 slope = kept_derivatives(derivatives, 0u, feature, n, point);
+            tangents.at[(COORDINATES + feature) * count + q] = dot(slope, v);
         }
         return;
     }
-    vec3 x = vector_at(points, point, n);
+    vec3 x = vector_of(points, n, point);
     Level level = levels.at[l];
     Cell cell = cell_of(level, x);
     uint entries[8];
@@ -44,7 +44,7 @@ void main() {
         [[unroll]] for (uint corner = 0u; corner < 8u; ++corner) corners[corner] = look_up(table, entries[corner], k);
         Interpolation e = interpolate(corners, cell.weight);
         [[unroll]] for (uint f = 2u * k; f < min(2u * k + 2u, FEATURES); ++f) {
-            tangents.at[(COORDINATES + l * FEATURES + f) * count + item()] = dot(slope_of(level, e, f % 2u), v);
+            tangents.at[(COORDINATES + l * FEATURES + f) * count + q] = dot(slope_of(level, e, f % 2u), v);
         }
     }
 }

@@ -15,8 +15,10 @@ layout(constant_id = 8) const uint HELD = 0;             // an invocation holds 
 layout(constant_id = 9) const uint STRAIGHT = 0;         // with HELD: no loops
 const uint TILES = (OUTPUTS + TILE - 1u) / TILE;
 const uint CHUNK = HELD != 0u ? INPUTS : 8u;             // inputs that are written out one after the other
+const uint LAST_CHUNK = INPUTS < CHUNK ? 0u : INPUTS / CHUNK - 1u;
 #include "lib/linear.glsl"
 #include "lib/straight.glsl"
+#include "lib/abreast.glsl"
 
 layout(push_constant, scalar) uniform Args {
     F32s x;         // [INPUTS, n]
@@ -30,21 +32,20 @@ layout(push_constant, scalar) uniform Args {
 float held[HELD != 0u ? INPUTS : 1u];
 
 // What `count` inputs from i0 on add to the outputs from `first` on.
-void add_products(inout float sum[TILE], uint first, uint i0, const uint count, uint sample_) {
+void add_products(inout float sum[TILE], uint first, uint i0, const uint count, Item sample_) {
     F32s block = from(weight, weight_index(first, i0));
     [[unroll]] for (uint i = 0u; i < count; ++i) {
-        float value = HELD != 0u ? held[i] : x.at[(i0 + i) * n + sample_];
+        float value = HELD != 0u ? held[i] : number_of(x, (i0 + i) * n, sample_);
         [[unroll]] for (uint t = 0u; t < TILE; ++t) sum[t] = fma(block.at[weight_index(t, i)], value, sum[t]);
     }
 }
 
 void main() {
-    // Invocations past the end do the last sample once more, and write what its own invocation writes; but where there is a gate, they
-    // may find y in its place already, and write nothing.
-    uint sample_ = min(item(), n - 1u);
-    bool writes = GATED == 0u || item() < n;
+    Item sample_ = item_of(0u, n);
+    // Where there is a gate, y may be in its place already when a sample is done again.
+    bool writes = GATED == 0u || !sample_.again;
     if (HELD != 0u) {
-        [[unroll]] for (uint i = 0u; i < INPUTS; ++i) held[i] = x.at[i * n + sample_];
+        [[unroll]] for (uint i = 0u; i < INPUTS; ++i) held[i] = number_of(x, i * n, sample_);
     }
     // Of what is held there is one chunk, but the compiler cannot know it: what a loop returns is summed up in it. Otherwise a software
     // device moves sums to where they are stored, away from their products, which then take the way over the stack.
@@ -56,13 +57,13 @@ void main() {
         uint first = min(tile * TILE, OUTPUTS - TILE);
         float sum[TILE];
         [[unroll]] for (uint t = 0u; t < TILE; ++t) sum[t] = BIAS != 0u ? bias.at[first + t] : 0.0;
-        [[unroll]] for (uint c = 0u; c < chunks; ++c) add_products(sum, first, c * CHUNK, CHUNK, sample_);
+        [[unroll]] for (uint c = 0u; c < chunks; ++c) add_products(sum, first, min(c, LAST_CHUNK) * CHUNK, CHUNK, sample_);
         add_products(sum, first, INPUTS / CHUNK * CHUNK, INPUTS % CHUNK, sample_);
         [[unroll]] for (uint t = 0u; t < TILE; ++t) {
             if (OUTPUTS % TILE == 0u || first + t >= tile * TILE) {
                 float value = activated(sum[t]);
-                uint at = (first + t) * n + sample_;
-                if (GATED != 0u && !(gate.at[at] > 0.0)) value = 0.0;
+                uint at = (first + t) * n + sample_.at;
+                if (GATED != 0u && !(number_of(gate, (first + t) * n, sample_) > 0.0)) value = 0.0;
                 if (writes) y.at[at] = value;
             }
         }

@@ -37,14 +37,13 @@ void main() {
     F32sMut table = table, first_moment = first_moment, second_moment = second_moment;
     U32sMut halves = halves;
     SumsMut grads = grads;
-    uint n_pairs = level.entries * FEATURES / 2u;  // levels have an even number of entries
+    uint n_pairs = level.entries * FEATURES / 2u;  // levels have an even number of entries, and more than a subgroup has lanes
     bool bad = bad_step.at[0] != 0u;
     Rates rates = Rates(rate, decay, correction, one_minus_beta1, one_minus_beta2, epsilon);
-    uint pair = first_item(TURNS);
+    uint first = first_of_subgroup(TURNS), row = level.offset * FEATURES;
     for (uint turn = 0u; turn < TURNS; ++turn) {
-        uint i = level.offset * FEATURES + 2u * pair;
-        if (pair < n_pairs) update_pair(table, halves, grads, first_moment, second_moment, i, bad, rates);
-        pair += items_abreast();
+        update_pair(table, halves, grads, first_moment, second_moment, row, item_from(first, n_pairs), bad, rates);
+        first += items_abreast();
     }
     // The next step marks this level again, and needs its stamps.
     if (whole == 1u) {

@@ -9,6 +9,7 @@ layout(constant_id = 5) const uint BIAS = 1;
 layout(constant_id = 6) const uint TILE = 8;         // hidden neurons per pass over the inputs; divides HIDDEN
 
 #include "lib/entry.glsl"
+#include "lib/abreast.glsl"
 
 const uint INPUTS = COORDINATES + LEVELS * FEATURES;
 
@@ -17,9 +18,9 @@ const uint INPUTS = COORDINATES + LEVELS * FEATURES;
 uint derivative_row(uint which, uint feature) { return which * LEVELS * FEATURES + feature; }
 
 // Three of a feature's, from a row on.
-vec3 kept_derivatives(F32s derivatives, uint row, uint feature, uint point, uint n) {
+vec3 kept_derivatives(F32s derivatives, uint row, uint feature, uint n, Item point) {
     vec3 d;
-    [[unroll]] for (uint i = 0u; i < 3u; ++i) d[i] = derivatives.at[derivative_row(row + i, feature) * n + point];
+    [[unroll]] for (uint i = 0u; i < 3u; ++i) d[i] = number_of(derivatives, derivative_row(row + i, feature) * n, point);
     return d;
 }
 

@@ -75,10 +75,11 @@ uint group() { return gl_WorkGroupID.y * gl_NumWorkGroups.x + gl_WorkGroupID.x; 
 // Index of this invocation among the launch's items. There may be more invocations, so a kernel leaves its body where item() >= n.
 uint item() { return group() * gl_WorkGroupSize.x + gl_LocalInvocationID.x; }
 
-// The same where an invocation has k items: its first; the next ones follow at distances of `items_abreast`. A software device takes one
-// subgroup through all of a loop before it begins with the next: what a subgroup goes over lies side by side.
+// Where an invocation has k items: the first of its subgroup's first items, one for each of its invocations; the next ones follow at
+// distances of `items_abreast` (lib/abreast.glsl). A software device takes one subgroup through all of a loop before it begins with the
+// next: what a subgroup goes over lies side by side.
 uint items_abreast() { return min(gl_SubgroupSize, LOCAL_SIZE); }
-uint first_item(uint k) { return (group() * gl_NumSubgroups + gl_SubgroupID) * k * items_abreast() + gl_SubgroupInvocationID; }
+uint first_of_subgroup(uint k) { return (group() * gl_NumSubgroups + gl_SubgroupID) * k * items_abreast(); }
 
 // The launch's second dimension (Work::slices): level, layer, axis.
 uint slice() { return gl_WorkGroupID.z; }

@@ -1,11 +1,12 @@
 // The hidden neurons of a field at an invocation's point, TILE of them at a time.
 #include "lib/straight.glsl"
+#include "lib/abreast.glsl"
 
 float z[INPUTS];  // the hidden layer's input
 float u[TILE];    // what its activation is applied to
 
-void load_input(F32s inputs, uint n, uint point) {
-    [[unroll]] for (uint i = 0u; i < INPUTS; ++i) z[i] = inputs.at[i * n + point];
+void load_input(F32s inputs, uint n, Item point) {
+    [[unroll]] for (uint i = 0u; i < INPUTS; ++i) z[i] = number_of(inputs, i * n, point);
 }
 
 // u = W₁z + b₁ of the tile whose weights and biases begin here.

@@ -126,6 +126,7 @@ impl Gpu {
             info.float_atomics = false;
             info.int64 = false;
             info.few_cores = false;
+            info.lanes_at_once = 0;
             info.full_subgroups = None;
             info.matrix = None;
         }
@@ -163,6 +164,7 @@ impl Gpu {
             offered,
             subgroup_size = info.subgroup_size,
             few_cores = info.few_cores,
+            lanes_at_once = info.lanes_at_once,
             float_atomics = info.float_atomics,
             matrix = ?info.matrix,
             "device chosen"

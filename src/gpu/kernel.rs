@@ -34,6 +34,8 @@ pub struct KernelModule {
     /// Whether it reads, or writes, through pointers found elsewhere than in the block.
     pub indirect_reads: bool,
     pub indirect_writes: bool,
+    /// Whether its lanes may read items abreast (glsl/lib/abreast.glsl).
+    pub lanes: bool,
 }
 
 /// A pointer in a push-constant block.
@@ -60,6 +62,7 @@ pub struct Kernel<A> {
     pub(super) pipeline: vk::Pipeline,
     pub(super) module: &'static KernelModule,
     pub(super) row: Arc<str>,
+    constants: Arc<[(u32, u32)]>,
     /// Keeps the pipeline alive.
     pub(super) gpu: Gpu,
     args: PhantomData<fn(A)>,
@@ -71,6 +74,7 @@ impl<A> Clone for Kernel<A> {
             pipeline: self.pipeline,
             module: self.module,
             row: self.row.clone(),
+            constants: self.constants.clone(),
             gpu: self.gpu.clone(),
             args: PhantomData,
         }
@@ -111,7 +115,7 @@ impl<A> Kernel<A> {
 }
 
 /// A pipeline's identity: kernel and specialisation constants.
-type Key = (&'static str, Vec<(u32, u32)>);
+type Key = (&'static str, Arc<[(u32, u32)]>);
 
 /// Pipelines by kernel and constants.
 pub(super) struct Pipelines {
@@ -127,6 +131,9 @@ pub(super) struct Pipelines {
 
 /// The constant of glsl/lib/cooperative.glsl that the caller decides.
 const COMPENSATED: u32 = 104;
+
+/// The constant of glsl/lib/abreast.glsl.
+const LANES: u32 = 110;
 
 /// Bytes of push constants that the common pipeline layout has; build.rs holds every kernel to them.
 const PUSH_CONSTANT_BYTES: u32 = 128;
@@ -211,6 +218,9 @@ impl Pipelines {
             _ => module.spirv,
         };
         let mut constants = constants.to_vec();
+        if module.lanes && constants.iter().all(|&(id, _)| id != LANES) {
+            constants.push((LANES, info.lanes_at_once));
+        }
         if module.matrix_tile.is_some() {
             constants.extend(&self.matrix_constants);
         }
@@ -325,7 +335,7 @@ impl Drop for Pipelines {
 impl Gpu {
     /// The kernel with these specialisation constants, built at the first call.
     pub fn kernel<S: KernelShape>(&self, shape: S) -> Result<Kernel<S::Args>> {
-        self.kernel_of(S::module(), shape.constants())
+        self.kernel_of(S::module(), shape.constants().into())
     }
 
     /// The same by cooperative matrices, operands in two float16s (`compensated`) or one; [`Kernel::matrix_tile`] divides its work.
@@ -341,17 +351,27 @@ impl Gpu {
         assert!(self.inner.info.matrix.is_some(), "cooperative matrices");
         let mut constants = shape.constants();
         constants.push((COMPENSATED, u32::from(compensated)));
-        self.kernel_of(module, constants)
+        self.kernel_of(module, constants.into())
+    }
+
+    /// The kernel's pipeline for so many items: where they are fewer than lanes read at once, each lane reads for itself.
+    pub(super) fn pipeline_for<A>(&self, kernel: &Kernel<A>, items: u64) -> Result<vk::Pipeline> {
+        if !kernel.module.lanes || items >= u64::from(self.inner.info.lanes_at_once) {
+            return Ok(kernel.pipeline);
+        }
+        let constants = kernel.constants.iter().copied().chain([(LANES, 0)]);
+        let few: Kernel<A> = self.kernel_of(kernel.module, constants.collect())?;
+        Ok(few.pipeline)
     }
 
     fn kernel_of<A>(
         &self,
         module: &'static KernelModule,
-        constants: Vec<(u32, u32)>,
+        constants: Arc<[(u32, u32)]>,
     ) -> Result<Kernel<A>> {
         let info = &self.inner.info;
         let pipelines = &self.inner.pipelines;
-        let key = (module.name, constants);
+        let key = (module.name, constants.clone());
         let mut built = pipelines.built.lock().expect("no panic under the lock");
         let (pipeline, row) = match built.get(&key) {
             Some((pipeline, row)) => (*pipeline, row.clone()),
@@ -375,6 +395,7 @@ impl Gpu {
             pipeline,
             module,
             row,
+            constants,
             gpu: self.clone(),
             args: PhantomData,
         })

@@ -33,6 +33,7 @@ const DEFAULT_BYTES: f64 = 64.0;
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Work {
     count: Count,
+    turns: u64,
     slices: u32,
     flops: Option<f64>,
     bytes: Option<f64>,
@@ -49,6 +50,7 @@ impl Work {
     pub fn items(n: u64) -> Work {
         Work {
             count: Count::Items(n),
+            turns: 1,
             slices: 1,
             flops: None,
             bytes: None,
@@ -61,6 +63,11 @@ impl Work {
             count: Count::Groups(n),
             ..Work::items(0)
         }
+    }
+
+    /// Each invocation takes so many of the items.
+    pub fn turns(self, turns: u64) -> Work {
+        Work { turns, ..self }
     }
 
     /// Repeats the launch along a second dimension (`slice()` in GLSL): levels, layers, axes.
@@ -168,7 +175,7 @@ impl<'a> Recorder<'a> {
     pub fn run<A: Pod>(&mut self, kernel: &Kernel<A>, work: Work, args: A) {
         let local = kernel.local_size() as u64;
         let groups = match work.count {
-            Count::Items(n) => n.div_ceil(local),
+            Count::Items(n) => n.div_ceil(local * work.turns),
             Count::Groups(n) => n,
         };
         if groups == 0 || work.slices == 0 || self.error.is_some() {
@@ -191,6 +198,17 @@ impl<'a> Recorder<'a> {
             kernel.row
         );
 
+        let pipeline = match work.count {
+            Count::Items(n) => self.gpu.pipeline_for(kernel, n),
+            Count::Groups(_) => Ok(kernel.pipeline),
+        };
+        let pipeline = match pipeline {
+            Ok(pipeline) => pipeline,
+            Err(error) => {
+                self.error = Some(error);
+                return;
+            }
+        };
         let block = bytemuck::bytes_of(&args);
         self.find_accesses(kernel, block);
         self.order(kernel.module.indirect_reads, kernel.module.indirect_writes);
@@ -224,11 +242,7 @@ impl<'a> Recorder<'a> {
                 self.begin_label(commands, &kernel.row);
                 // SAFETY: an open command buffer, a pipeline made with this layout, a block within its range.
                 unsafe {
-                    device.cmd_bind_pipeline(
-                        commands,
-                        vk::PipelineBindPoint::COMPUTE,
-                        kernel.pipeline,
-                    );
+                    device.cmd_bind_pipeline(commands, vk::PipelineBindPoint::COMPUTE, pipeline);
                     device.cmd_push_constants(
                         commands,
                         layout,

@@ -315,6 +315,8 @@ impl Field {
             Ok(kernel.labelled(label))
         };
         let network = format!("{label} network");
+        // Where points without further heads have a launch of their own, all others have some.
+        let with_heads = if few_cores { 2 } else { 1 };
         let by_chain_rule = match shape.gradient {
             true => Some(GradientKernels {
                 encoding: match kept {
@@ -381,8 +383,8 @@ impl Field {
             encoding: forward_part(1, 0, &encoding)?,
             forward: Network {
                 kernel: match few_cores || by_matrices {
-                    true => forward_part(2, 1, &network)?,
-                    false => forward_part(0, 1, label)?,
+                    true => forward_part(2, with_heads, &network)?,
+                    false => forward_part(0, with_heads, label)?,
                 },
                 headless: match few_cores {
                     true => Some(forward_part(2, 0, &network)?),
@@ -393,7 +395,7 @@ impl Field {
             by_matrices,
             few_cores,
             backward: Network {
-                kernel: backward(1)?,
+                kernel: backward(with_heads)?,
                 headless: match few_cores {
                     true => Some(backward(0)?),
                     false => None,
@@ -517,15 +519,15 @@ impl Field {
             bytes += self.derivative_bytes(self.kept());
         }
         let kernel = keeping.unwrap_or(&self.encoding);
-        let groups = match self.few_cores {
-            true => ENCODERS,
-            false => buffers.n.div_ceil(kernel.local_size()),
+        let turns = match self.few_cores {
+            true => buffers.n.div_ceil(ENCODERS * kernel.local_size()).max(1),
+            false => 1,
         };
-        let of_group = f64::from(buffers.n) / f64::from(groups) / levels;
-        let work = Work::groups(groups.into())
+        let work = Work::items(buffers.n.into())
+            .turns(turns.into())
             .slices(self.shape.grid.levels)
-            .flops(flops * of_group)
-            .bytes(bytes * of_group);
+            .flops(flops / levels)
+            .bytes(bytes / levels);
         rec.run(kernel, work, args);
     }
 

@@ -77,10 +77,8 @@ impl Adam {
                 0 => &self.kernel,
                 _ => &self.with_copy,
             };
-            let of_group = 2 * self.turns * u64::from(kernel.local_size());
-            let work = Work::groups(n.div_ceil(of_group))
-                .flops(15.0 * of_group as f64)
-                .bytes(32.0 * of_group as f64);
+            let work = Work::items(n.div_ceil(2)).turns(self.turns);
+            let work = work.flops(30.0).bytes(64.0);
             rec.run(kernel, work, args);
         }
     }

@@ -176,6 +176,26 @@ fn many_points_are_the_sum_of_fewer() -> Result<()> {
     Ok(())
 }
 
+/// Fewer points than a subgroup has lanes, and not many more, with heads and without.
+#[test]
+fn a_few_points_are_the_sum_of_each() -> Result<()> {
+    let gpu = &open(&[])?;
+    let kept = |kept| FieldShape { kept, ..SHAPE };
+    let (whole, alone) = (field(gpu, kept(2))?, field(gpu, kept(2))?);
+    let range = WITH_HEADS - 19..WITH_HEADS + 5;
+    let n = range.len();
+    let d_points = backward(gpu, &whole, range.clone())?;
+    for (i, point) in range.enumerate() {
+        let of_point = backward(gpu, &alone, point..point + 1)?;
+        let of_whole = [0, 1, 2].map(|axis| d_points[axis * n + i]);
+        assert_gradient("what a point hears", &wide(&of_whole), &wide(&of_point));
+    }
+    let of_each = gradients(gpu, &alone.1)?;
+    assert_gradients(&whole.1, &gradients(gpu, &whole.1)?, &of_each);
+    assert_valid(gpu);
+    Ok(())
+}
+
 #[test]
 fn derivatives_that_are_kept_are_those_looked_up() -> Result<()> {
     let gpu = &open(&[])?;

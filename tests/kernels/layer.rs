@@ -9,11 +9,14 @@ use neurodin::{Error, Result};
 use std::collections::BTreeSet;
 use std::sync::OnceLock;
 
-/// (inputs, outputs, samples): narrow, odd in every direction, blocks whose weights leave lanes over, and several tiles of everything.
-const SIZES: [(usize, usize, usize); 5] = [
+/// (inputs, outputs, samples): narrow, odd in every direction, blocks whose weights leave lanes over, fewer samples than lanes, and several
+/// tiles of everything.
+const SIZES: [(usize, usize, usize); 7] = [
     (5, 3, 70),
     (70, 37, 333),
     (45, 35, 70),
+    (64, 33, 3),
+    (130, 40, 7),
     (64, 64, 64),
     (256, 258, 1100),
 ];
