@@ -118,10 +118,10 @@ impl LazyTable {
         let n_levels = rows.len() as u32;
         let end = u64::from(last.offset) + u64::from(last.entries);
         let slots = (end / WORD + u64::from(n_levels) + 1) * WORD;
-        // Counted in bytes, settling an entry by itself is worth it for up to 65 % of them. A processor pays for finding them, too;
-        // where between a fifth and a half it breaks even has not been measured well (tools/runs/throughput.md).
+        // Counted in bytes, settling an entry by itself is worth it for up to 65 % of them. A processor pays for finding them, too: at 28 %
+        // it is better to go over all (tools/runs/throughput.md).
         let (strip, most) = match gpu.info().few_cores {
-            true => (32, 0.35),
+            true => (32, 0.25),
             false => (2, 0.65),
         };
         let half = u32::from(half);
