@@ -180,8 +180,8 @@ fn many_points_are_the_sum_of_fewer() -> Result<()> {
 #[test]
 fn a_few_points_are_the_sum_of_each() -> Result<()> {
     let gpu = &open(&[])?;
-    let kept = |kept| FieldShape { kept, ..SHAPE };
-    let (whole, alone) = (field(gpu, kept(2))?, field(gpu, kept(2))?);
+    let shape = FieldShape { kept: 2, ..SHAPE };
+    let (whole, alone) = (field(gpu, shape)?, field(gpu, shape)?);
     let range = WITH_HEADS - 19..WITH_HEADS + 5;
     let n = range.len();
     let d_points = backward(gpu, &whole, range.clone())?;
