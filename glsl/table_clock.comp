@@ -31,8 +31,13 @@ void main() {
     barrier();
     if (row < LEVELS) {
         LevelUse use = uses.at[row];
-        bool mostly = float(use.marked) > most * float(levels.at[row].entries);
-        uses.at[row] = LevelUse(0u, use.whole != 0u ? use.whole - 1u : mostly ? WHOLE : 0u);
+        uint whole = use.whole - 1u;
+        if (use.whole <= 1u) {
+            bool mostly = float(use.marked) > most * float(levels.at[row].entries);
+            // One that stays whole has nothing to be brought up to date, which WHOLE would ask for.
+            whole = mostly ? WHOLE - use.whole : 0u;
+        }
+        uses.at[row] = LevelUse(0u, whole);
     }
     if (bad) return;
     uint next = (now + 1u) % READINGS;

@@ -17,7 +17,7 @@ layout(push_constant, scalar) uniform Args {
 void main() {
     uint point = item();
     uint l = level_of_slice(LEVELS);
-    if (point >= n || uses.at[l].whole != 0u) return;
+    if (point >= n || uses.at[l].whole > 1u) return;  // in its last step as a whole one, a level is counted
     Level level = levels.at[l];
     Cell cell = cell_of(level, vector_at(points, point, n));
     uint marked = 0u;

@@ -6,8 +6,9 @@
 #include "lib/hash_grid.glsl"
 #include "lib/lazy_table.glsl"
 
-layout(constant_id = 0) const uint FEATURES = 2;
-layout(constant_id = 1) const uint STRIP = 16;  // words of 32 marks: long strips have equally much to do, short ones are many
+layout(constant_id = 0) const uint LEVELS = 12;
+layout(constant_id = 1) const uint FEATURES = 2;
+layout(constant_id = 2) const uint STRIP = 16;  // words of 32 marks: long strips have equally much to do, short ones are many
 #include "lib/entry.glsl"
 #include "lib/half_copy.glsl"
 
@@ -72,7 +73,7 @@ void settle(uint entry, uint slot, uint now) {
 }
 
 void main() {
-    uint l = slice();
+    uint l = level_of_slice(LEVELS);
     uint whole = uses.at[l].whole;
     bool becomes_whole = after_update != 0u && whole == WHOLE;
     if (whole != 0u && !becomes_whole) return;

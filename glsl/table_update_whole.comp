@@ -6,8 +6,9 @@
 #include "lib/lazy_table.glsl"
 #include "lib/update_pair.glsl"
 
-layout(constant_id = 0) const uint FEATURES = 2;
-layout(constant_id = 1) const uint TURNS = 64;  // pairs of parameters of an invocation: few workgroups where there is nothing to do
+layout(constant_id = 0) const uint LEVELS = 12;
+layout(constant_id = 1) const uint FEATURES = 2;
+layout(constant_id = 2) const uint TURNS = 64;  // pairs of parameters of an invocation: few workgroups where there is nothing to do
 
 layout(push_constant, scalar) uniform Args {
     Levels levels;
@@ -29,7 +30,7 @@ layout(push_constant, scalar) uniform Args {
 };
 
 void main() {
-    uint l = slice();
+    uint l = level_of_slice(LEVELS);
     uint whole = uses.at[l].whole;
     if (whole == 0u) return;
     Level level = levels.at[l];

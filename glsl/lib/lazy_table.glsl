@@ -9,12 +9,13 @@
 // with the bias corrections c1 = 1 − β₁ᵗ, c2 = √(1 − β₂ᵗ). E, S, b and the powers are the same for all entries that stand at one reading,
 // and lie in a row for each. Clock and stamps count modulo 256: nothing is left alone for as many steps (table_settle sweeps).
 //
-// A level is marked entry by entry before a step reads it. Where most of it turns out to be needed, it is brought up to date, and `whole`
-// for some steps: then it is updated whole, and needs neither marks nor stamps.
+// A level is marked entry by entry before a step reads it. Where so much of it turns out to be needed that going over all is cheaper, it is
+// brought up to date, and `whole` for some steps: then it is updated whole, and needs neither marks nor stamps. The last of them marks it
+// again, to see whether it still is.
 #include "lib/adam.glsl"
 
 const uint READINGS = 256u;
-const uint WHOLE = 64u;  // steps after which a level is marked again, to see whether most of it still is
+const uint WHOLE = 64u;  // steps for which a level becomes whole
 
 // What an entry has missed.
 struct Lag {

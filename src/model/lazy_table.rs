@@ -118,14 +118,15 @@ impl LazyTable {
         let n_levels = rows.len() as u32;
         let end = u64::from(last.offset) + u64::from(last.entries);
         let slots = (end / WORD + u64::from(n_levels) + 1) * WORD;
-        // Counted in bytes, settling an entry by itself is worth it for up to 65 % of them. A processor pays for finding them, too: at 28 %
-        // it is better to go over all (tools/runs/throughput.md).
+        // Counted in bytes, settling an entry by itself is worth it for up to 65 % of them. A processor pays for finding it, too, whatever
+        // its features (tools/runs/throughput.md).
         let (strip, most) = match gpu.info().few_cores {
-            true => (32, 0.25),
+            true => (32, 0.06 + 0.0125 * features as f32),
             false => (2, 0.65),
         };
         let half = u32::from(half);
         let whole = table_update_whole::Shape {
+            levels: n_levels,
             features,
             half,
             ..table_update_whole::Shape::default()
@@ -163,6 +164,7 @@ impl LazyTable {
             tick: gpu.kernel(table_clock::Shape { levels: n_levels })?,
             settle: Sweep::new(
                 gpu.kernel(table_settle::Shape {
+                    levels: n_levels,
                     features,
                     strip,
                     half,
