@@ -21,7 +21,7 @@ layout(push_constant, scalar) uniform Args {
     F32s inputs;             // [INPUTS, n]
     F32s tangents;           // [INPUTS, m] ȧ, with SECOND_ORDER
     F32s d_first;            // [n]
-    F32s d_hidden;           // [HIDDEN, n_hidden] from the other heads
+    F32s d_hidden;           // [HIDDEN, stride_hidden] from the other heads
     F32sMut d_preactivation; // [HIDDEN, m] d_u
     F32sMut steepness;       // [HIDDEN, m] s, with SECOND_ORDER
     F32sMut d_inputs;        // [INPUTS, m] d_z; without SECOND_ORDER [LEVELS * FEATURES, m] d_e
@@ -29,6 +29,7 @@ layout(push_constant, scalar) uniform Args {
     SumsMut d_head_bias;     // [1] accumulated
     uint n;
     uint n_hidden;
+    uint stride_hidden;
     uint begin;              // the points of this launch
     uint end;
     uint first;              // of the m points for which there is scratch memory
@@ -45,7 +46,7 @@ void main() {
     F32s hidden_weight = hidden_weight, hidden_bias = hidden_bias, head_weight = head_weight, d_hidden = d_hidden;
     F32sMut d_preactivation = d_preactivation, steepness = steepness;
     SumsMut d_head_weight = d_head_weight;
-    uint n_hidden = n_hidden, m = m;
+    uint n_hidden = n_hidden, stride_hidden = stride_hidden, m = m;
     // Invocations past the end stay for the subgroup's sums, to which they add nothing, and write as all others do: a software device pays
     // as much for a branch around a store as for the store. (Summing up in shared memory first would halve its speed, too: a barrier costs
     // more there than an atomic add.)
@@ -82,7 +83,7 @@ void main() {
             float slope = activation_derivative(u[t]);
             float d_w2 = d_out * activation(u[t]);
             float d_h = d_out * w2;
-            if (has_heads) d_h += HEADS == 2u ? number_of(d_hidden, neuron * n_hidden, point) : d_hidden.at[neuron * n_hidden + point.at];
+            if (has_heads) d_h += HEADS == 2u ? number_of(d_hidden, neuron * stride_hidden, point) : d_hidden.at[neuron * stride_hidden + point.at];
             float d_u = d_h * slope;
             if (SECOND_ORDER != 0u) {
                 d_w2 += s_dot[t] * slope;

@@ -22,7 +22,7 @@ layout(push_constant, scalar) uniform Args {
     F32s inputs;             // [INPUTS, n]
     F32s tangents;           // [INPUTS, m] ȧ, with SECOND_ORDER
     F32s d_first;            // [n]
-    F32s d_hidden;           // [HIDDEN, n_hidden] from the other heads
+    F32s d_hidden;           // [HIDDEN, stride_hidden] from the other heads
     F32sMut d_preactivation; // [HIDDEN, m] d_u
     F32sMut steepness;       // [HIDDEN, m] s, with SECOND_ORDER
     F32sMut d_inputs;        // [INPUTS, m] d_z; without SECOND_ORDER [LEVELS * FEATURES, m] d_e
@@ -30,6 +30,7 @@ layout(push_constant, scalar) uniform Args {
     SumsMut d_head_bias;     // [1] accumulated
     uint n;
     uint n_hidden;
+    uint stride_hidden;
     uint begin;              // the points of this launch
     uint end;
     uint first;              // of the m points for which there is scratch memory
@@ -65,7 +66,7 @@ float take(uint i, uint p, float value) {
     }
     float d_out = d_first.at[point], w2 = head_weight.at[neuron], slope = activation_derivative(u);
     float d_w2 = d_out * activation(u), d_h = d_out * w2;
-    if (HEADS != 0u && point < n_hidden) d_h += d_hidden.at[neuron * n_hidden + point];
+    if (HEADS != 0u && point < n_hidden) d_h += d_hidden.at[neuron * stride_hidden + point];
     float d_u = d_h * slope;
     if (SECOND_ORDER != 0u) {
         d_w2 += value * slope;

@@ -27,11 +27,12 @@ layout(push_constant, scalar) uniform Args {
     F32s head_bias;      // [1]
     F32s points;         // [3, n] region frame
     F32sMut inputs;      // [INPUTS, n] z, kept for the backward pass
-    F32sMut hidden;      // [HIDDEN, n_hidden] h of the first n_hidden points, for further heads
+    F32sMut hidden;      // [HIDDEN, stride_hidden] h of the first n_hidden points, for further heads
     F32sMut first;       // [n] out
     F32sMut derivatives; // [3 KEPT, LEVELS·FEATURES, n] of the encoding
     uint n;
     uint n_hidden;
+    uint stride_hidden;
     uint begin;          // the points of this launch
     uint end;
 };
@@ -91,7 +92,7 @@ void main() {
     // sums that are used there, while their products wait on the stack.
     F32s hidden_weight = hidden_weight, hidden_bias = hidden_bias, head_weight = head_weight;
     F32sMut hidden = hidden;
-    uint n_hidden = n_hidden;
+    uint n_hidden = n_hidden, stride_hidden = stride_hidden;
     load_input(reading(inputs), n, point);
 
     float sum = BIAS != 0u ? head_bias.at[0] : 0.0;
@@ -103,7 +104,7 @@ void main() {
         [[unroll]] for (uint t = 0u; t < TILE; ++t) {
             float h = activation(u[t]);
             sum = fma(head_weight.at[first_neuron + t], h, sum);
-            if (HEADS != 0u && (HEADS == 2u || point.at < n_hidden)) hidden.at[(first_neuron + t) * n_hidden + point.at] = h;
+            if (HEADS != 0u && (HEADS == 2u || point.at < n_hidden)) hidden.at[(first_neuron + t) * stride_hidden + point.at] = h;
         }
         first_neuron += TILE;
     } while (first_neuron < neurons);

@@ -22,11 +22,12 @@ layout(push_constant, scalar) uniform Args {
     F32s head_bias;      // [1]
     F32s points;         // [3, n] region frame
     F32sMut inputs;      // [INPUTS, n] z, kept for the backward pass
-    F32sMut hidden;      // [HIDDEN, n_hidden] h of the first n_hidden points, for further heads
+    F32sMut hidden;      // [HIDDEN, stride_hidden] h of the first n_hidden points, for further heads
     F32sMut first;       // [n] out
     F32sMut derivatives; // PART 1 alone
     uint n;
     uint n_hidden;
+    uint stride_hidden;
     uint begin;          // the points of this launch
     uint end;
 };
@@ -50,7 +51,7 @@ float take(uint m, uint p, float value) {
     uint neuron = first_neuron + m, point = first_point() + p;
     if (neuron >= HIDDEN || point >= end) return 0.0;
     float h = activation(value + (BIAS != 0u ? hidden_bias.at[neuron] : 0.0));
-    if (HEADS != 0u && point < n_hidden) hidden.at[neuron * n_hidden + point] = h;
+    if (HEADS != 0u && point < n_hidden) hidden.at[neuron * stride_hidden + point] = h;
     return head_weight.at[neuron] * h;
 }
 

@@ -4,7 +4,7 @@
 #extension GL_EXT_shader_explicit_arithmetic_types_float16 : require
 #define LOCAL_SIZE 128
 #include "lib/prelude.glsl"
-// linear by cooperative matrices: a tile of output channels (the slice) times a tile of samples per workgroup.
+// linear by cooperative matrices: a tile of output channels times a tile of samples per workgroup; those of the same samples are neighbours.
 
 layout(constant_id = 0) const uint INPUTS = 64;
 layout(constant_id = 1) const uint OUTPUTS = 64;
@@ -18,17 +18,21 @@ const bool A_IS_COLUMN_MAJOR = TRANSPOSED != 0u, B_IS_COLUMN_MAJOR = false;
 #include "lib/linear.glsl"
 
 layout(push_constant, scalar) uniform Args {
-    F32s x;         // [INPUTS, n]
+    F32s x;         // [INPUTS, stride_x]
     F32s weight;    // forward [OUTPUTS, WEIGHT_COLUMNS], transposed [INPUTS, WEIGHT_COLUMNS]
     F32s bias;      // [OUTPUTS]
-    F32s gate;      // [OUTPUTS, n] post-ReLU values
-    F32sMut y;      // [OUTPUTS, n]
+    F32s gate;      // [OUTPUTS, stride_y] post-ReLU values
+    F32sMut y;      // [OUTPUTS, stride_y]
     uint n;
+    uint stride_x;
+    uint stride_y;
 };
 
-uint first_output() { return slice() * TILE_M; }
+const uint PARTS = (OUTPUTS + TILE_M - 1u) / TILE_M;
 
-uint first_sample() { return group() * TILE_N; }
+uint first_output() { return group() % PARTS * TILE_M; }
+
+uint first_sample() { return group() / PARTS * TILE_N; }
 
 float a_at(uint m, uint k) {
     uint o = first_output() + m;
@@ -37,13 +41,13 @@ float a_at(uint m, uint k) {
 
 float b_at(uint k, uint s) {
     uint sample_ = first_sample() + s;
-    return k < INPUTS && sample_ < n ? x.at[k * n + sample_] : 0.0;
+    return k < INPUTS && sample_ < n ? x.at[k * stride_x + sample_] : 0.0;
 }
 
 float take(uint m, uint s, float value) {
     uint o = first_output() + m, sample_ = first_sample() + s;
     if (o >= OUTPUTS || sample_ >= n) return 0.0;
-    uint at = o * n + sample_;
+    uint at = o * stride_y + sample_;
     if (BIAS != 0u) value += bias.at[o];
     if (GATED != 0u && !(gate.at[at] > 0.0)) value = 0.0;
     y.at[at] = activated(value);

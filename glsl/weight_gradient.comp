@@ -16,12 +16,13 @@ const uint SUMMED_ROWS = ROWS != 0u ? ROWS : 1u;  // no array is empty
 const uint SUMS = SUMMED_ROWS * TILE;
 
 layout(push_constant, scalar) uniform Args {
-    F32s x;            // [INPUTS, n]
-    F32s d_y;          // [OUTPUTS, n]
+    F32s x;            // [INPUTS, stride_x]
+    F32s d_y;          // [OUTPUTS, stride_d_y]
     SumsMut d_weight;  // [OUTPUTS, INPUTS] accumulated
     SumsMut d_bias;    // [OUTPUTS] accumulated
     uint n;
-    uint stride_x;     // samples between channels of x (x may be the front part of a longer buffer)
+    uint stride_x;     // at least n
+    uint stride_d_y;
     uint chunk;        // samples per workgroup
 };
 
@@ -29,7 +30,7 @@ layout(push_constant, scalar) uniform Args {
 void add_products(inout float sum[TILE], inout float bias, uint o, uint i0, uint s0, const uint count) {
     float d[SAMPLES];
     [[unroll]] for (uint k = 0u; k < count; ++k) {
-        d[k] = d_y.at[o * n + s0 + k];
+        d[k] = d_y.at[o * stride_d_y + s0 + k];
         bias += d[k];
     }
     [[unroll]] for (uint t = 0u; t < TILE; ++t) {
@@ -78,7 +79,7 @@ void samples_as_lanes(uint i0, uint s0, uint end) {
     for (uint s = s0 + 2u * gl_LocalInvocationID.x; s < end; s += 2u * gl_WorkGroupSize.x) {
         vec2 d[SUMMED_ROWS];
         [[unroll]] for (uint r = 0u; r < ROWS; ++r) {
-            d[r] = pair_at(d_y, min(o0 + r, OUTPUTS - 1u) * n + s);
+            d[r] = pair_at(d_y, min(o0 + r, OUTPUTS - 1u) * stride_d_y + s);
             bias[r] += d[r].x + d[r].y;
         }
         [[unroll]] for (uint t = 0u; t < TILE; ++t) {

@@ -14,12 +14,13 @@ const bool A_IS_COLUMN_MAJOR = false, B_IS_COLUMN_MAJOR = true;
 #include "lib/cooperative.glsl"
 
 layout(push_constant, scalar) uniform Args {
-    F32s x;            // [INPUTS, n]
-    F32s d_y;          // [OUTPUTS, n]
+    F32s x;            // [INPUTS, stride_x]
+    F32s d_y;          // [OUTPUTS, stride_d_y]
     SumsMut d_weight;  // [OUTPUTS, INPUTS] accumulated
     SumsMut d_bias;    // [OUTPUTS] accumulated
     uint n;
-    uint stride_x;     // samples between channels of x (x may be the front part of a longer buffer)
+    uint stride_x;     // at least n
+    uint stride_d_y;
     uint chunk;        // samples per workgroup, a multiple of TILE_K
 };
 
@@ -31,7 +32,7 @@ uint first_input() { return slice() % TILES * TILE_N; }
 
 float a_at(uint m, uint s) {
     uint o = first_output() + m;
-    return o < OUTPUTS && s < n ? d_y.at[o * n + s] : 0.0;
+    return o < OUTPUTS && s < n ? d_y.at[o * stride_d_y + s] : 0.0;
 }
 
 float b_at(uint s, uint input_) {
@@ -53,7 +54,7 @@ void main() {
     uint end_output = min(first_output() + TILE_M, OUTPUTS);
     for (uint o = first_output() + gl_SubgroupID; o < end_output; o += SUBGROUPS) {
         float bias = 0.0;
-        for (uint s = first + gl_SubgroupInvocationID; s < end; s += SUBGROUP) bias += d_y.at[o * n + s];
+        for (uint s = first + gl_SubgroupInvocationID; s < end; s += SUBGROUP) bias += d_y.at[o * stride_d_y + s];
         bias = subgroupAdd(bias);
         if (subgroupElect()) add(d_bias, o, bias);
     }

@@ -25,11 +25,14 @@ Item item_from(uint first, uint end) {
     return LANES == 0u ? Item(min(at, end - 1u), 0u, at >= end) : Item(at, whole, at < first);
 }
 
-// The item of an invocation that has one, of those from begin to end.
-Item item_of(uint begin, uint end) {
-    uint at = begin + item();
-    return LANES == 0u ? Item(min(at, end - 1u), 0u, at >= end) : item_from(begin + first_of_subgroup(1u), end);
+// The item of an invocation that has one, of those from begin to end, as if its workgroup had this index.
+Item item_of(uint workgroup, uint begin, uint end) {
+    uint at = begin + workgroup * gl_WorkGroupSize.x + gl_LocalInvocationID.x;
+    uint first = begin + (workgroup * gl_NumSubgroups + gl_SubgroupID) * items_abreast();
+    return LANES == 0u ? Item(min(at, end - 1u), 0u, at >= end) : item_from(first, end);
 }
+
+Item item_of(uint begin, uint end) { return item_of(group(), begin, end); }
 
 // The same item where `begin` is counted as 0.
 Item counted_from(uint begin, Item item) { return Item(item.at - begin, item.first - begin, item.again); }

@@ -34,6 +34,7 @@ const DEFAULT_BYTES: f64 = 64.0;
 pub struct Work {
     count: Count,
     turns: u64,
+    parts: u32,
     slices: u32,
     flops: Option<f64>,
     bytes: Option<f64>,
@@ -51,6 +52,7 @@ impl Work {
         Work {
             count: Count::Items(n),
             turns: 1,
+            parts: 1,
             slices: 1,
             flops: None,
             bytes: None,
@@ -70,12 +72,17 @@ impl Work {
         Work { turns, ..self }
     }
 
+    /// So many workgroups, neighbours in the launch, take a part each of what the same items ask for (`group() % parts` in GLSL).
+    pub fn parts(self, k: u32) -> Work {
+        Work { parts: k, ..self }
+    }
+
     /// Repeats the launch along a second dimension (`slice()` in GLSL): levels, layers, axes.
     pub fn slices(self, k: u32) -> Work {
         Work { slices: k, ..self }
     }
 
-    /// Floating-point operations of one item in one slice, for estimates and the profile.
+    /// Floating-point operations of one item in one part and slice, for estimates and the profile.
     pub fn flops(self, per_item: f64) -> Work {
         Work {
             flops: Some(per_item),
@@ -83,7 +90,7 @@ impl Work {
         }
     }
 
-    /// Bytes that one item in one slice moves.
+    /// Bytes that one item in one part and slice moves.
     pub fn bytes(self, per_item: f64) -> Work {
         Work {
             bytes: Some(per_item),
@@ -106,9 +113,9 @@ impl Work {
         )
     }
 
-    /// Items in all slices.
+    /// Items in all parts and slices.
     fn total(&self) -> f64 {
-        self.count() as f64 * self.slices as f64
+        self.count() as f64 * f64::from(self.parts) * f64::from(self.slices)
     }
 }
 
@@ -177,7 +184,7 @@ impl<'a> Recorder<'a> {
         let groups = match work.count {
             Count::Items(n) => n.div_ceil(local * work.turns),
             Count::Groups(n) => n,
-        };
+        } * u64::from(work.parts);
         if groups == 0 || work.slices == 0 || self.error.is_some() {
             return;
         }

@@ -6,9 +6,10 @@ use super::field::{Field, FieldBuffers, FieldShape, Scratch};
 use super::hash_grid::HashGrid;
 use super::layer::{Activation, Layer, LayerShape};
 use super::params::{Draws, Group, Init, Params, ParamsPlan};
+use super::planes::{Activations, Planes};
 use crate::Result;
 use crate::config::{BackgroundKind, Config};
-use crate::gpu::{Buffer, Gpu, Kernel, Ptr, PtrMut, Recorder, Work};
+use crate::gpu::{Buffer, Gpu, Kernel, Ptr, Recorder, Work};
 use crate::kernels::{
     background_composite_backward, background_composite_forward, background_constant,
     background_constant_backward, background_points, background_shade, sigmoid_backward,
@@ -202,7 +203,7 @@ struct RadianceBuffers {
     d_raw: Buffer<f32>,       // [n]
     shading: Buffer<f32>,     // [geometry + appearance + 16, n] glsl/lib/background.glsl
     d_shading: Buffer<f32>,   // [geometry + appearance, n]
-    hidden: [Buffer<f32>; 2], // [64, n]; in the backward pass its gradient takes its place
+    hidden: [Activations; 2], // [64, n]; in the backward pass its gradient takes its place
     rgb: Buffer<f32>,         // [3, n]
     d_rgb: Buffer<f32>,       // [3, n]
 }
@@ -327,7 +328,10 @@ impl Radiance {
             d_raw: scratch("d_raw", 1)?,
             shading: scratch("shading", self.geometry + self.appearance_dims + HARMONICS)?,
             d_shading: scratch("d_shading", self.geometry + self.appearance_dims)?,
-            hidden: [scratch("hidden 0", 64)?, scratch("hidden 1", 64)?],
+            hidden: [
+                Activations::new(gpu, "background hidden 0", 64, n)?,
+                Activations::new(gpu, "background hidden 1", 64, n)?,
+            ],
             rgb: scratch("rgb", 3)?,
             d_rgb: scratch("d_rgb", 3)?,
         })
@@ -361,8 +365,9 @@ impl Radiance {
         );
         self.field
             .forward(rec, params, r.points.ptr(), &r.field, r.raw.ptr_mut());
+        let shading = Planes::new(r.shading.ptr_mut(), n);
         self.heads
-            .forward(rec, params, r.field.hidden.ptr(), r.shading.ptr_mut(), n);
+            .forward(rec, params, r.field.hidden.read(), shading, n);
         let args = background_shade::Args {
             directions: rays.directions,
             ray_view: rays.ray_view,
@@ -376,9 +381,11 @@ impl Radiance {
             Work::items(u64::from(n)).flops(60.0).bytes(64.0),
             args,
         );
-        self.colors[0].forward(rec, params, r.shading.ptr(), r.hidden[0].ptr_mut(), n);
-        self.colors[1].forward(rec, params, r.hidden[0].ptr(), r.hidden[1].ptr_mut(), n);
-        self.colors[2].forward(rec, params, r.hidden[1].ptr(), r.rgb.ptr_mut(), n);
+        let rgb = Planes::new(r.rgb.ptr_mut(), n);
+        let activations = [shading, r.hidden[0].write(), r.hidden[1].write(), rgb];
+        for (color, pair) in self.colors.iter().zip(activations.windows(2)) {
+            color.forward(rec, params, pair[0].read(), pair[1], n);
+        }
         let args = background_composite_forward::Args {
             edges: r.edges.ptr(),
             raw: r.raw.ptr(),
@@ -429,15 +436,13 @@ impl Radiance {
             Work::items(3 * u64::from(n)).bytes(12.0),
             args,
         );
-        let xs = [r.shading.ptr(), r.hidden[0].ptr(), r.hidden[1].ptr()];
-        let d_xs: [PtrMut<f32>; 3] = [
-            r.d_shading.ptr_mut(),
-            r.hidden[0].ptr_mut(),
-            r.hidden[1].ptr_mut(),
-        ];
-        let mut d_y = r.d_rgb.ptr();
+        let shading = Planes::new(r.shading.ptr(), n);
+        let xs = [shading, r.hidden[0].read(), r.hidden[1].read()];
+        let d_shading = Planes::new(r.d_shading.ptr_mut(), n);
+        let d_xs = [d_shading, r.hidden[0].write(), r.hidden[1].write()];
+        let mut d_y = Planes::new(r.d_rgb.ptr(), n);
         for layer in (0..3).rev() {
-            self.colors[layer].gradient(rec, params, xs[layer], n, d_y, n);
+            self.colors[layer].gradient(rec, params, xs[layer], d_y, n);
             self.colors[layer].backward(rec, params, d_y, xs[layer], d_xs[layer], n);
             d_y = d_xs[layer].read();
         }
@@ -459,11 +464,11 @@ impl Radiance {
                 args,
             );
         }
-        let (hidden, d_hidden) = (r.field.hidden.ptr(), r.field.hidden.ptr_mut());
+        let (hidden, d_hidden) = (r.field.hidden.read(), r.field.hidden.write());
         self.heads
-            .gradient(rec, params, hidden, n, r.d_shading.ptr(), n);
+            .gradient(rec, params, hidden, d_shading.read(), n);
         self.heads
-            .backward(rec, params, r.d_shading.ptr(), hidden, d_hidden, n);
+            .backward(rec, params, d_shading.read(), hidden, d_hidden, n);
         self.field.backward(
             rec,
             params,

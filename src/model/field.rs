@@ -4,6 +4,7 @@ use super::forms::Forms;
 use super::hash_grid::HashGrid;
 use super::layer::{Activation, Layer, LayerShape};
 use super::params::{Params, WeightHandle};
+use super::planes::Planes;
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, Kernel, Ptr, PtrMut, Recorder, Work};
 use crate::kernels::{
@@ -12,8 +13,10 @@ use crate::kernels::{
 };
 use std::ops::Range;
 
-/// Points that go back through a field at once: the memory that this takes is theirs alone.
-const AT_ONCE: u32 = 1 << 16;
+mod buffers;
+
+use buffers::{AT_ONCE, Slope};
+pub use buffers::{FieldBuffers, Scratch};
 
 /// Workgroups that encode a level of all points on devices with few cores, each of which reads it into its core's cache first.
 const ENCODERS: u32 = 2;
@@ -132,79 +135,6 @@ enum Scatter {
     Owned(Kernel<hash_grid_backward_owned::Args>),
 }
 
-/// What one evaluation of a field over `n` points leaves for its backward pass.
-pub struct FieldBuffers {
-    pub n: u32,
-    /// Leading points whose hidden activations are kept for further heads.
-    pub n_hidden: u32,
-    pub inputs: Buffer<f32>, // [inputs, n]
-    pub hidden: Buffer<f32>, // [hidden, n_hidden]; in the backward pass the heads put its gradient in its place
-    slope: Option<Slope>,
-}
-
-/// The gradient of a field's first output, and what its backward pass reads.
-pub struct Slope {
-    pub gradient: Buffer<f32>,        // [3, n] g, per region unit
-    pub d_gradient: Buffer<f32>,      // [3, n]
-    slopes: Buffer<f32>,              // [inputs, n] a
-    derivatives: Option<Buffer<f32>>, // [3 · order, hash features, n] of the encoding, where they are kept
-}
-
-impl Slope {
-    fn derivatives(&self) -> PtrMut<f32> {
-        let kept = self.derivatives.as_ref();
-        kept.map_or(PtrMut::NULL, Buffer::ptr_mut)
-    }
-}
-
-impl FieldBuffers {
-    /// Buffers for `n` points of fields of this shape.
-    pub fn new(gpu: &Gpu, name: &str, shape: &FieldShape, n: u32, n_hidden: u32) -> Result<Self> {
-        let hidden_len = u64::from(shape.hidden) * u64::from(n_hidden.max(1));
-        let planes = |what: &str, channels: u32| {
-            gpu.scratch(
-                &format!("{name} {what}"),
-                u64::from(channels) * u64::from(n),
-            )
-        };
-        let slope = match shape.gradient {
-            true => Some(Slope {
-                gradient: planes("gradient", 3)?,
-                d_gradient: planes("d_gradient", 3)?,
-                slopes: planes("slopes", shape.inputs())?,
-                derivatives: match shape.kept_on(gpu) {
-                    0 => None,
-                    order => Some(planes("derivatives", 3 * order * shape.grid.outputs())?),
-                },
-            }),
-            false => None,
-        };
-        Ok(FieldBuffers {
-            n,
-            n_hidden,
-            inputs: planes("inputs", shape.inputs())?,
-            hidden: gpu.scratch(&format!("{name} hidden"), hidden_len)?,
-            slope,
-        })
-    }
-
-    /// The gradient's buffers.
-    ///
-    /// # Panics
-    /// If the field has none.
-    pub fn slope(&self) -> &Slope {
-        self.slope.as_ref().expect("a field with a gradient")
-    }
-}
-
-/// Memory that a field's backward pass needs only while it runs, for m points at once; one for all fields.
-pub struct Scratch {
-    d_preactivation: Buffer<f32>, // [hidden, m] of the largest field
-    d_inputs: Buffer<f32>, // [inputs, m] of the largest field; only the hash features' rows where nobody asks for the others
-    steepness: Buffer<f32>, // [hidden, m] of the largest field with a gradient: s
-    tangents: Buffer<f32>, // [inputs, m] of the largest field with a gradient: ȧ
-}
-
 /// A stretch of points on their way back through a field.
 struct Pass<'a> {
     params: &'a Params,
@@ -212,24 +142,6 @@ struct Pass<'a> {
     buffers: &'a FieldBuffers,
     scratch: &'a Scratch,
     chunk: Range<u32>,
-}
-
-impl Scratch {
-    /// Enough for each of the given (shape, points).
-    pub fn new(gpu: &Gpu, users: &[(FieldShape, u32)]) -> Result<Self> {
-        let most = |per_point: fn(&FieldShape) -> u32| {
-            let sizes = users
-                .iter()
-                .map(|(shape, n)| u64::from(per_point(shape)) * u64::from((*n).min(AT_ONCE)));
-            sizes.max().unwrap_or(1).max(1)
-        };
-        Ok(Scratch {
-            d_preactivation: gpu.scratch("d_preactivation", most(|s| s.hidden))?,
-            d_inputs: gpu.scratch("d_inputs", most(FieldShape::inputs))?,
-            steepness: gpu.scratch("steepness", most(|s| s.with_gradient(s.hidden)))?,
-            tangents: gpu.scratch("tangents", most(|s| s.with_gradient(s.inputs())))?,
-        })
-    }
 }
 
 impl Field {
@@ -548,7 +460,7 @@ impl Field {
             head_bias: params.bias(self.heads, 0),
             points,
             inputs: buffers.inputs.ptr_mut(),
-            hidden: buffers.hidden.ptr_mut(),
+            hidden: buffers.hidden.write().first,
             first,
             derivatives: match &buffers.slope {
                 Some(slope) => slope.derivatives(),
@@ -556,6 +468,7 @@ impl Field {
             },
             n: buffers.n,
             n_hidden: buffers.n_hidden,
+            stride_hidden: buffers.hidden.stride,
             begin: launch.start,
             end: launch.end,
         }
@@ -661,7 +574,7 @@ impl Field {
             inputs: buffers.inputs.ptr(),
             tangents: scratch.tangents.ptr(),
             d_first,
-            d_hidden: buffers.hidden.ptr(),
+            d_hidden: buffers.hidden.read().first,
             d_preactivation: scratch.d_preactivation.ptr_mut(),
             steepness: scratch.steepness.ptr_mut(),
             d_inputs: scratch.d_inputs.ptr_mut(),
@@ -669,6 +582,7 @@ impl Field {
             d_head_bias: params.d_bias(self.heads, 0),
             n,
             n_hidden: buffers.n_hidden,
+            stride_hidden: buffers.hidden.stride,
             begin: 0,
             end: 0,
             first: chunk.start,
@@ -686,17 +600,20 @@ impl Field {
             rec.run(kernel, work, args);
         }
         let inputs = buffers.inputs.ptr().offset(u64::from(chunk.start));
-        let (layer, d_preactivation) = (&self.hidden_layer, scratch.d_preactivation.ptr());
+        let inputs = Planes::new(inputs, n);
+        let layer = &self.hidden_layer;
+        let d_preactivation = Planes::new(scratch.d_preactivation.ptr(), m);
         if self.by_matrices {
-            let d_inputs = scratch.d_inputs.ptr_mut();
+            let d_inputs = Planes::new(scratch.d_inputs.ptr_mut(), m);
             layer.backward(rec, params, d_preactivation, inputs, d_inputs, m);
         }
-        layer.gradient(rec, params, inputs, n, d_preactivation, m);
+        layer.gradient(rec, params, inputs, d_preactivation, m);
         if let Some(kernels) = &self.by_chain_rule {
-            let (tangents, steepness) = (scratch.tangents.ptr(), scratch.steepness.ptr());
+            let tangents = Planes::new(scratch.tangents.ptr(), m);
+            let steepness = Planes::new(scratch.steepness.ptr(), m);
             kernels
                 .steepness
-                .gradient(rec, params, tangents, m, steepness, m);
+                .gradient(rec, params, tangents, steepness, m);
         }
     }
 

@@ -2,8 +2,9 @@
 
 use super::layer::{Activation, Layer, LayerShape, MOST_HELD};
 use super::params::{Group, Params, ParamsPlan};
+use super::planes::Activations;
 use crate::Result;
-use crate::gpu::{Buffer, DeviceKind, Gpu, Kernel, KernelShape, Matrices, Recorder};
+use crate::gpu::{DeviceKind, Gpu, Kernel, KernelShape, Matrices, Recorder};
 
 /// How one product is computed: by cooperative matrices where it is wide, otherwise with so many channels per invocation, in one of the
 /// ways that the kernels know.
@@ -130,7 +131,7 @@ impl Forms {
                 "forward",
                 &linear,
                 with_linear,
-                |t, layer, rec| layer.forward(rec, &t.params, t.x.ptr(), t.y.ptr_mut(), t.n),
+                |t, layer, rec| layer.forward(rec, &t.params, t.x.read(), t.y.write(), t.n),
             )?,
             gradient: Trial::fastest(
                 gpu,
@@ -138,7 +139,7 @@ impl Forms {
                 "gradient",
                 &gradient,
                 with_gradient,
-                |t, layer, rec| layer.gradient(rec, &t.params, t.x.ptr(), t.n, t.y.ptr(), t.n),
+                |t, layer, rec| layer.gradient(rec, &t.params, t.x.read(), t.y.read(), t.n),
             )?,
         })
     }
@@ -184,8 +185,8 @@ pub fn layer_ways(gpu: &Gpu, width: u32) -> Vec<String> {
 struct Trial {
     layers: Vec<Layer>,
     params: Params,
-    x: Buffer<f32>, // [width, n]
-    y: Buffer<f32>, // [width, n]
+    x: Activations, // [width, n]
+    y: Activations, // [width, n]
     n: u32,
 }
 
@@ -209,8 +210,8 @@ impl Trial {
         Ok(Trial {
             layers: layers.collect::<Result<_>>()?,
             params: plan.build(gpu, 0, true)?,
-            x: gpu.buffer("trial x", rows * u64::from(n))?,
-            y: gpu.buffer("trial y", rows * u64::from(n))?,
+            x: Activations::new(gpu, "trial x", width, n)?,
+            y: Activations::new(gpu, "trial y", width, n)?,
             n,
         })
     }

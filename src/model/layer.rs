@@ -1,7 +1,8 @@
-//! One fully connected layer on planar activations `[channel, n]`: forward, gradient of the inputs, gradient of the weights.
+//! One fully connected layer on planar activations: forward, gradient of the inputs, gradient of the weights.
 
 use super::forms::{Form, Forms};
 use super::params::{Params, WeightHandle};
+use super::planes::Planes;
 use crate::Result;
 use crate::gpu::{Gpu, Kernel, Ptr, PtrMut, Recorder, Work};
 use crate::kernels::{linear, weight_gradient};
@@ -55,7 +56,7 @@ struct Product {
     inputs: u32,
     outputs: u32,
     /// Parts into which a launch cuts the outputs.
-    slices: u32,
+    parts: u32,
 }
 
 /// Inputs that an invocation of `linear` holds at most: with more, its code would no longer fit a processor's cache.
@@ -75,7 +76,7 @@ impl Product {
             ..shape
         };
         let kernel = forms.linear.kernel(gpu, [inputs, outputs], shape)?;
-        let slices = match kernel.matrix_tile() {
+        let parts = match kernel.matrix_tile() {
             Some([rows, _]) => outputs.div_ceil(rows),
             None if held => 1,
             None => outputs.div_ceil(tile),
@@ -84,7 +85,7 @@ impl Product {
             kernel: kernel.labelled(label),
             inputs,
             outputs,
-            slices,
+            parts,
         })
     }
 
@@ -94,9 +95,9 @@ impl Product {
             None => (Work::items(args.n.into()), 1),
         };
         let connections = f64::from(self.inputs) * f64::from(self.outputs);
-        let share = f64::from(samples) / f64::from(self.slices);
+        let share = f64::from(samples) / f64::from(self.parts);
         let work = work
-            .slices(self.slices)
+            .parts(self.parts)
             .flops(2.0 * connections * share)
             .bytes(4.0 * f64::from(self.inputs + self.outputs) * share);
         rec.run(&self.kernel, work, args);
@@ -206,29 +207,32 @@ impl Layer {
         &self,
         rec: &mut Recorder,
         params: &Params,
-        x: Ptr<f32>,
-        y: PtrMut<f32>,
+        x: Planes<Ptr<f32>>,
+        y: Planes<PtrMut<f32>>,
         n: u32,
     ) {
         let args = linear::Args {
-            x,
+            x: x.first,
             weight: params.weight(self.handle, self.weight_offset()),
             bias: params.bias(self.handle, u64::from(self.first_row)),
             gate: Ptr::NULL,
-            y,
+            y: y.first,
             n,
+            stride_x: x.stride,
+            stride_y: y.stride,
         };
         self.forward.run(rec, args);
     }
 
-    /// `d_x [backward_inputs, n]` from the gradient `d_y [outputs, n]` before the activation; `x` gates it where the inputs are ReLU's.
+    /// `d_x [backward_inputs, n]` from the gradient `d_y [outputs, n]` before the activation; `x` gates it where the inputs are ReLU's, and
+    /// then has the stride of `d_x`, which may take its place.
     pub fn backward(
         &self,
         rec: &mut Recorder,
         params: &Params,
-        d_y: Ptr<f32>,
-        x: Ptr<f32>,
-        d_x: PtrMut<f32>,
+        d_y: Planes<Ptr<f32>>,
+        x: Planes<Ptr<f32>>,
+        d_x: Planes<PtrMut<f32>>,
         n: u32,
     ) {
         let product = self
@@ -236,37 +240,42 @@ impl Layer {
             .as_ref()
             .expect("a layer built without input gradients was asked for them");
         let args = linear::Args {
-            x: d_y,
+            x: d_y.first,
             weight: params.weight(self.handle, self.weight_offset()),
             bias: Ptr::NULL,
-            gate: x,
-            y: d_x,
+            gate: x.first,
+            y: d_x.first,
             n,
+            stride_x: d_y.stride,
+            stride_y: d_x.stride,
         };
         product.run(rec, args);
     }
 
-    /// Adds the gradients of weights and bias, from `x` (channels `stride_x` apart) and `d_y [outputs, n]`.
+    /// Adds the gradients of weights and bias, from `x [inputs, n]` and `d_y [outputs, n]`.
     pub fn gradient(
         &self,
         rec: &mut Recorder,
         params: &Params,
-        x: Ptr<f32>,
-        stride_x: u32,
-        d_y: Ptr<f32>,
+        x: Planes<Ptr<f32>>,
+        d_y: Planes<Ptr<f32>>,
         n: u32,
     ) {
+        let even = [n, x.stride, d_y.stride]
+            .iter()
+            .all(|count| count.is_multiple_of(2));
         let gradient = match &self.paired_gradient {
-            Some(paired) if n.is_multiple_of(2) && stride_x.is_multiple_of(2) => paired,
+            Some(paired) if even => paired,
             _ => &self.gradient,
         };
         let args = weight_gradient::Args {
-            x,
-            d_y,
+            x: x.first,
+            d_y: d_y.first,
             d_weight: params.d_weight(self.handle, self.weight_offset()),
             d_bias: params.d_bias(self.handle, u64::from(self.first_row)),
             n,
-            stride_x,
+            stride_x: x.stride,
+            stride_d_y: d_y.stride,
             chunk: gradient.chunk,
         };
         let slices =

@@ -9,6 +9,7 @@ mod hash_grid;
 mod layer;
 mod lazy_table;
 mod params;
+mod planes;
 mod proposal;
 mod surface;
 
@@ -19,6 +20,7 @@ pub use hash_grid::HashGrid;
 pub use layer::{Activation, Layer, LayerShape};
 pub use lazy_table::{LazyTable, Rates};
 pub use params::{Group, Init, Params, ParamsPlan, Span, WeightHandle};
+pub use planes::{Activations, Planes};
 pub use proposal::{Proposal, ProposalBuffers};
 pub use surface::{ShadeInputs, Surface, SurfaceBuffers, TapStep};
 

@@ -5,6 +5,7 @@ use super::field::{Field, FieldBuffers, FieldShape, Scratch};
 use super::hash_grid::HashGrid;
 use super::layer::{Activation, Layer, LayerShape};
 use super::params::{Draws, Group, Init, Params, ParamsPlan};
+use super::planes::{Activations, Planes};
 use crate::Result;
 use crate::config::{Config, DensityKind, GradientKind, ScaleKind};
 use crate::gpu::{Buffer, Gpu, Kernel, Ptr, PtrMut, Recorder, Work};
@@ -45,11 +46,12 @@ pub struct SurfaceBuffers {
     pub d_sdf: Buffer<f32>,  // [blocks, n]
     pub shading: Buffer<f32>, // [rows, n] glsl/lib/shading.glsl; row 0 is the scale logit
     pub d_shading: Buffer<f32>, // [rows that receive gradients, n]
-    pub hidden: Vec<Buffer<f32>>, // per hidden colour layer [width, n]; in the backward pass its gradient takes its place
-    pub rgb: Buffer<f32>,         // [3, n] sigmoid output, not padded
-    pub d_rgb: Buffer<f32>,       // [3, n]
-    pub eikonal: Buffer<f32>,     // [n]
-    pub curvature: Buffer<f32>,   // [n] weighted, where there is a curvature loss
+    /// Per hidden colour layer [width, n]; in the backward pass its gradient takes its place.
+    pub hidden: Vec<Activations>,
+    pub rgb: Buffer<f32>,       // [3, n] sigmoid output, not padded
+    pub d_rgb: Buffer<f32>,     // [3, n]
+    pub eikonal: Buffer<f32>,   // [n]
+    pub curvature: Buffer<f32>, // [n] weighted, where there is a curvature loss
     /// ∂loss/∂g of a gradient by taps, through its other uses, where it has any.
     tap_d_gradient: Option<Buffer<f32>>, // [3, n]
 }
@@ -345,7 +347,7 @@ impl Surface {
         let width = |layer: usize| self.colors[layer].outputs();
         let hidden_layers = self.colors.len() - 1;
         let hidden = (0..hidden_layers)
-            .map(|l| gpu.scratch(&format!("color hidden {l}"), u64::from(width(l)) * n64));
+            .map(|l| Activations::new(gpu, &format!("color hidden {l}"), width(l), n));
         let rows = u64::from(self.gradient_rows() + 3 + DIRECTION_ENCODING);
         Ok(SurfaceBuffers {
             n,
@@ -384,8 +386,13 @@ impl Surface {
             }
             false => Ptr::NULL, // the kernel takes it from the taps
         };
-        self.heads
-            .forward(rec, params, b.field.hidden.ptr(), b.shading.ptr_mut(), b.n);
+        self.heads.forward(
+            rec,
+            params,
+            b.field.hidden.read(),
+            Planes::new(b.shading.ptr_mut(), b.n),
+            b.n,
+        );
         let args = shade_forward::Args {
             sdf: b.sdf.ptr(),
             tap_draws: inputs.tap_draws,
@@ -410,9 +417,12 @@ impl Surface {
         );
         let mut x = self.color_inputs(b);
         for (layer, color) in self.colors.iter().enumerate() {
-            let y = b.hidden.get(layer).unwrap_or(&b.rgb);
-            color.forward(rec, params, x, y.ptr_mut(), b.n);
-            x = y.ptr();
+            let y = match b.hidden.get(layer) {
+                Some(hidden) => hidden.write(),
+                None => Planes::new(b.rgb.ptr_mut(), b.n),
+            };
+            color.forward(rec, params, x, y, b.n);
+            x = y.read();
         }
     }
 
@@ -444,16 +454,16 @@ impl Surface {
             n: 3 * n,
         };
         rec.run(&self.sigmoid_backward, work, args);
-        let mut d_y = b.d_rgb.ptr();
+        let mut d_y = Planes::new(b.d_rgb.ptr(), n);
         for (layer, color) in self.colors.iter().enumerate().rev() {
             let (x, d_x) = match layer {
                 0 => (
                     self.color_inputs(b),
-                    b.d_shading.ptr_mut().offset(u64::from(n)),
+                    Planes::new(b.d_shading.ptr_mut().offset(u64::from(n)), n),
                 ),
-                _ => (b.hidden[layer - 1].ptr(), b.hidden[layer - 1].ptr_mut()),
+                _ => (b.hidden[layer - 1].read(), b.hidden[layer - 1].write()),
             };
-            color.gradient(rec, params, x, n, d_y, n);
+            color.gradient(rec, params, x, d_y, n);
             color.backward(rec, params, d_y, x, d_x, n);
             d_y = d_x.read();
         }
@@ -493,11 +503,11 @@ impl Surface {
                 args,
             );
         }
-        let (hidden, d_hidden) = (b.field.hidden.ptr(), b.field.hidden.ptr_mut());
+        let (hidden, d_hidden) = (b.field.hidden.read(), b.field.hidden.write());
+        let d_heads = Planes::new(b.d_shading.ptr(), n);
+        self.heads.gradient(rec, params, hidden, d_heads, n);
         self.heads
-            .gradient(rec, params, hidden, n, b.d_shading.ptr(), n);
-        self.heads
-            .backward(rec, params, b.d_shading.ptr(), hidden, d_hidden, n);
+            .backward(rec, params, d_heads, hidden, d_hidden, n);
         self.field.backward(
             rec,
             params,
@@ -509,8 +519,8 @@ impl Surface {
         );
     }
 
-    fn color_inputs(&self, b: &SurfaceBuffers) -> Ptr<f32> {
-        b.shading.ptr().offset(u64::from(b.n))
+    fn color_inputs(&self, b: &SurfaceBuffers) -> Planes<Ptr<f32>> {
+        Planes::new(b.shading.ptr().offset(u64::from(b.n)), b.n)
     }
 
     /// Element of `shading` at which the gradient's three rows begin.

@@ -112,7 +112,10 @@ fn backward(
     let d_gradient = planes(6, 3, 0.1, range);
     gpu.upload(&buffers.slope().d_gradient, 0, &d_gradient)?;
     let d_hidden = planes(7, SHAPE.hidden as usize, 1.0, with_heads);
-    gpu.upload(&buffers.hidden, 0, &d_hidden)?;
+    let stride = u64::from(buffers.hidden.stride);
+    for (row, plane) in d_hidden.chunks_exact(n_hidden.max(1) as usize).enumerate() {
+        gpu.upload(&buffers.hidden.values, row as u64 * stride, plane)?;
+    }
     gpu.submit("backward", |rec| {
         let hear = Some(d_points.ptr_mut());
         field.backward(

@@ -3,7 +3,7 @@
 use crate::harness::Random;
 use neurodin::gpu::{Buffer, Gpu, GpuOptions, Matrices};
 use neurodin::model::{
-    Activation, Group, Init, Layer, LayerShape, ParamsPlan, WeightHandle, layer_ways,
+    Activation, Group, Init, Layer, LayerShape, ParamsPlan, Planes, WeightHandle, layer_ways,
 };
 use neurodin::{Error, Result};
 use std::collections::BTreeSet;
@@ -108,17 +108,29 @@ impl Case {
         };
         let layer = Layer::new(gpu, "layer", shape, handle)?;
         let params = plan.build(gpu, 1, true)?;
-        let filled = |name: &str, values: &[f64]| -> Result<Buffer<f32>> {
-            let buffer = gpu.buffer(name, values.len() as u64)?;
-            gpu.upload(&buffer, 0, &single(values)).map(|()| buffer)
+        // Each of them with gaps of its own between planes, which nobody reads or writes.
+        let filled = |name: &str, values: &[f64], stride: u32| {
+            let mut spread = Vec::new();
+            for plane in single(values).chunks(self.n) {
+                spread.extend(plane);
+                spread.resize(spread.len() + (stride - n) as usize, f32::NAN);
+            }
+            let buffer = gpu.buffer(name, spread.len() as u64)?;
+            gpu.upload(&buffer, 0, &spread)?;
+            Ok::<_, Error>(Planes::new(buffer, stride))
         };
-        let (x, d_y) = (filled("x", &self.x)?, filled("d_y", &self.d_y)?);
-        let y = gpu.scratch("y", u64::from(outputs * n))?;
+        let x = filled("x", &self.x, n + 6)?;
+        let d_y = filled("d_y", &self.d_y, n + 2)?;
+        let y = filled("y", &vec![0.0; self.d_y.len()], n + 4)?;
         gpu.submit("layer", |rec| {
-            layer.forward(rec, &params, x.ptr(), y.ptr_mut(), n);
-            layer.gradient(rec, &params, x.ptr(), n, d_y.ptr(), n);
+            let reading =
+                |planes: &Planes<Buffer<f32>>| Planes::new(planes.first.ptr(), planes.stride);
+            let writing =
+                |planes: &Planes<Buffer<f32>>| Planes::new(planes.first.ptr_mut(), planes.stride);
+            layer.forward(rec, &params, reading(&x), writing(&y), n);
+            layer.gradient(rec, &params, reading(&x), reading(&d_y), n);
             // In place, as networks do it.
-            layer.backward(rec, &params, d_y.ptr(), x.ptr(), x.ptr_mut(), n);
+            layer.backward(rec, &params, reading(&d_y), reading(&x), writing(&x), n);
             Ok(())
         })?;
         // While the buffers live: their guard words go with them.
@@ -127,9 +139,19 @@ impl Case {
         assert!(overruns.is_empty(), "written past an end: {overruns:?}");
         let wide = |values: Vec<f32>| values.into_iter().map(f64::from).collect();
         let grads = |first, len| gpu.download(params.grads(), first, len).map(wide);
+        let gathered = |planes: &Planes<Buffer<f32>>| {
+            let spread = gpu.download(&planes.first, 0, planes.first.len())?;
+            let mut values = Vec::new();
+            for plane in spread.chunks(planes.stride as usize) {
+                let (inside, gap) = plane.split_at(self.n);
+                assert!(gap.iter().all(|x| x.is_nan()), "written between planes");
+                values.extend_from_slice(inside);
+            }
+            Ok::<_, Error>(wide(values))
+        };
         Ok([
-            gpu.download(&y, 0, y.len()).map(wide)?,
-            gpu.download(&x, 0, x.len()).map(wide)?,
+            gathered(&y)?,
+            gathered(&x)?,
             grads(0, u64::from(outputs * inputs))?,
             grads(bias, outputs.into())?,
         ])

@@ -198,6 +198,7 @@ impl Bench {
             d_bias: PtrMut::NULL,
             n: 1,
             stride_x: 1,
+            stride_d_y: 1,
             chunk: 1,
         };
         let outputs = u64::from(self.add.local_size());
