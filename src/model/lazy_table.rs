@@ -121,7 +121,7 @@ impl LazyTable {
         // Counted in bytes, settling an entry by itself is worth it for up to 65 % of them. A processor pays for finding it, too, whatever
         // its features (tools/runs/throughput.md).
         let (strip, most) = match gpu.info().few_cores {
-            true => (32, 0.06 + 0.0125 * features as f32),
+            true => (32, 0.03 + 0.0275 * features as f32),
             false => (2, 0.65),
         };
         let half = u32::from(half);
