@@ -46,7 +46,7 @@ void main() {
         update_pair(table, halves, grads, first_moment, second_moment, row, item_from(first, n_pairs), bad, rates);
         first += items_abreast();
     }
-    // The next step marks this level again, and needs its stamps.
+    // Unless the level stays whole, the next step settles its entries one by one, and needs their stamps.
     if (whole == 1u) {
         uint next = bad ? clock.at[0] : (clock.at[0] + 1u) % READINGS;
         uint n_words = (level.entries + 3u) / 4u, per_group = 2u * LOCAL_SIZE * TURNS / FEATURES / 4u;

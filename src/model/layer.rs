@@ -25,6 +25,7 @@ pub struct Layer {
     forward: Product,
     /// Adjoint with respect to the first `backward_inputs` inputs; none where nobody asks for them.
     backward: Option<Product>,
+    inputs_are_relu: bool,
     gradient: WeightGradient,
     /// What reads samples in pairs, of which there must be an even number.
     paired_gradient: Option<WeightGradient>,
@@ -188,6 +189,7 @@ impl Layer {
             handle,
             forward: Product::new(gpu, &format!("{label} forward"), base, forms)?,
             backward,
+            inputs_are_relu: shape.inputs_are_relu,
             gradient: WeightGradient::new(gpu, label, gradient, forms.gradient)?,
             paired_gradient,
         })
@@ -239,6 +241,12 @@ impl Layer {
             .backward
             .as_ref()
             .expect("a layer built without input gradients was asked for them");
+        assert!(
+            !self.inputs_are_relu || x.stride == d_x.stride,
+            "a gate whose planes lie {} apart, for gradients {} apart",
+            x.stride,
+            d_x.stride
+        );
         let args = linear::Args {
             x: d_y.first,
             weight: params.weight(self.handle, self.weight_offset()),
