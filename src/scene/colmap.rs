@@ -66,10 +66,9 @@ pub(super) fn read(path: &Path, model: &Path) -> Result<Reading> {
     };
     let (cameras_file, images_file) = (require("cameras")?, require("images")?);
     let cameras = read_cameras(&cameras_file)?;
-    let mut images = read_images(&images_file)?;
-    images.sort_by(|a, b| a.name.cmp(&b.name));
-
     let (mut skipped, mut notes) = (Vec::new(), Vec::new());
+    let mut images = read_images(&images_file, &mut notes)?;
+    images.sort_by(|a, b| a.name.cmp(&b.name));
     let points = match part(model, "points3D") {
         Some(file) => read_points(&file, &mut notes)?,
         None => {
@@ -184,7 +183,7 @@ pub(super) fn adopt_points(reading: &mut Reading, model: &Path) {
             why,
         });
     };
-    let other = match part(model, "images").map(|file| read_images(&file)) {
+    let other = match part(model, "images").map(|file| read_images(&file, &mut reading.notes)) {
         Some(Ok(images)) => images,
         Some(Err(error)) => {
             return skip(format!(
@@ -304,11 +303,11 @@ fn read_cameras(file: &Path) -> Result<HashMap<u32, Camera>> {
     }
 }
 
-fn read_images(file: &Path) -> Result<Vec<ImageRecord>> {
+fn read_images(file: &Path, notes: &mut Vec<String>) -> Result<Vec<ImageRecord>> {
     if is_binary(file) {
         binary::images(file)
     } else {
-        text::images(file)
+        text::images(file, notes)
     }
 }
 
@@ -317,7 +316,7 @@ fn read_points(file: &Path, notes: &mut Vec<String>) -> Result<Vec<Point>> {
     let mut points = if is_binary(file) {
         binary::points(file)?
     } else {
-        text::points(file)?
+        text::points(file, notes)?
     };
     let all = points.len();
     points.retain(|point| point.position.is_finite());

@@ -333,6 +333,24 @@ fn damaged_colmap_texts_name_the_line() {
 }
 
 #[test]
+fn a_colmap_text_that_ends_between_two_images_is_said() {
+    let rig = Rig::skewed(3);
+    let dataset = Dataset::new();
+    rig.write_pictures(&dataset.at("images"));
+    rig.write_colmap_text(&dataset.at("sparse/0"));
+    let path = dataset.at("sparse/0/images.txt");
+    let text = fs::read_to_string(&path).unwrap();
+    for (stated, notes) in [(rig.views.len(), 0), (rig.views.len() + 2, 1)] {
+        let head = format!("# Number of images: {stated}, mean observations per image: 1\n");
+        fs::write(&path, head + &text).unwrap();
+        let scene = dataset.open().unwrap();
+        assert_eq!(scene.notes.len(), notes, "{:?}", scene.notes);
+    }
+    let note = dataset.open().unwrap().notes.concat();
+    assert!(note.contains("holds 3 images, but says 5"), "{note}");
+}
+
+#[test]
 fn points_that_are_not_finite_are_left_out_and_missing_points_said() {
     let rig = Rig::skewed(3);
     let dataset = colmap(&rig);

@@ -37,6 +37,20 @@ impl<'a> Lines<'a> {
             rest: line.trim(),
         })
     }
+
+    /// Notes where the comment on top says that there are more than were read: a file that ends between two of them is no error in itself.
+    fn note_missing(&self, what: &str, read: usize, notes: &mut Vec<String>) {
+        let comments = self.text.lines().take_while(|line| line.starts_with('#'));
+        let stated = comments
+            .filter_map(|line| line.strip_prefix("# Number of ")?.strip_prefix(what))
+            .find_map(|rest| rest.strip_prefix(": ")?.split(',').next()?.parse().ok());
+        if let Some(stated) = stated.filter(|&stated: &usize| stated > read) {
+            notes.push(format!(
+                "{} holds {read} {what}, but says {stated} on top: it ends early, or some were taken out",
+                self.file.display()
+            ));
+        }
+    }
 }
 
 impl<'a> Words<'a> {
@@ -95,11 +109,11 @@ pub(super) fn cameras(file: &Path) -> Result<HashMap<u32, Camera>> {
     Ok(cameras)
 }
 
-pub(super) fn images(file: &Path) -> Result<Vec<ImageRecord>> {
+pub(super) fn images(file: &Path, notes: &mut Vec<String>) -> Result<Vec<ImageRecord>> {
     let lines = Lines::open(file)?;
     let mut images = Vec::new();
-    let mut lines = lines.all();
-    while let Some(mut words) = lines.next() {
+    let mut all = lines.all();
+    while let Some(mut words) = all.next() {
         if words.is_comment_or_empty() {
             continue;
         }
@@ -118,7 +132,7 @@ pub(super) fn images(file: &Path) -> Result<Vec<ImageRecord>> {
             t,
         )?);
         // The second line, which may be empty, holds (x, y, point) for every feature.
-        if let Some(observed) = lines.next() {
+        if let Some(observed) = all.next() {
             let count = observed.rest.split_whitespace().count();
             if count % 3 != 0 {
                 return Err(observed.error(format!(
@@ -127,10 +141,11 @@ pub(super) fn images(file: &Path) -> Result<Vec<ImageRecord>> {
             }
         }
     }
+    lines.note_missing("images", images.len(), notes);
     Ok(images)
 }
 
-pub(super) fn points(file: &Path) -> Result<Vec<Point>> {
+pub(super) fn points(file: &Path, notes: &mut Vec<String>) -> Result<Vec<Point>> {
     let lines = Lines::open(file)?;
     let mut points = Vec::new();
     for mut words in lines.all().filter(|words| !words.is_comment_or_empty()) {
@@ -142,5 +157,6 @@ pub(super) fn points(file: &Path) -> Result<Vec<Point>> {
         }
         points.push(Point { position, color });
     }
+    lines.note_missing("points", points.len(), notes);
     Ok(points)
 }
