@@ -11,7 +11,7 @@ layout(push_constant, scalar) uniform Args {
     F32s query_sdf;      // [2 n_rays]: at P + eps d, then at P + offset d
     F32s gate;           // [n_rays] 0 or 1
     F32sMut loss;        // [n_rays] after scale
-    F32sMut d_query_sdf; // [2 n_rays] after scale; the second half is zero, its values are only compared
+    F32sMut d_query_sdf; // [n_rays] of the first after scale; the second is only compared
     uint n_rays;
     float eps;
     float scale; // the loss's weight / number of rays
@@ -30,6 +30,5 @@ void main() {
         bool violated = raised > 0.0 && query_sdf.at[n_rays + ray] > 0.0;
         loss.at[ray] = violated ? factor * scale * raised : 0.0;
         d_query_sdf.at[ray] = violated ? factor * scale : 0.0;
-        d_query_sdf.at[n_rays + ray] = 0.0;
     }
 }

@@ -503,7 +503,7 @@ impl Field {
         rec.run(&self.kernels().gradient, work, args);
     }
 
-    /// Adds all parameter gradients, from `d_first [n]`, for the leading points the heads' gradients in `buffers.hidden`, and for a field
+    /// Adds all parameter gradients, from `d_first [n_back]`, for the leading points the heads' gradients in `buffers.hidden`, and for a field
     /// with a gradient `d_gradient` of its buffers. Those of such a field's points go into `d_points [3, n]` where they are asked for.
     #[allow(clippy::too_many_arguments)] // what a pass over the points needs; a struct would only rename them
     pub fn backward(
@@ -516,13 +516,13 @@ impl Field {
         scratch: &Scratch,
         d_points: Option<PtrMut<f32>>,
     ) {
-        for begin in (0..buffers.n).step_by(AT_ONCE as usize) {
+        for begin in (0..buffers.n_back).step_by(AT_ONCE as usize) {
             let pass = Pass {
                 params,
                 points,
                 buffers,
                 scratch,
-                chunk: begin..buffers.n.min(begin + AT_ONCE),
+                chunk: begin..buffers.n_back.min(begin + AT_ONCE),
             };
             if let Some(slope) = &buffers.slope {
                 self.tangent(rec, &pass, slope);

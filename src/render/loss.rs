@@ -43,7 +43,7 @@ pub struct Loss {
     queries: Buffer<f32>,     // [3, 2 n_rays] behind the heaviest sample, by ε and by c
     query_field: FieldBuffers,
     query_sdf: Buffer<f32>,   // [2, n_rays]
-    d_query_sdf: Buffer<f32>, // [2, n_rays]
+    d_query_sdf: Buffer<f32>, // [n_rays] of the first; the second is only compared
     pub tangent: Option<Tangent>,
     pub supervision: Option<Supervision>,
     /// Weight of the squared colour error.
@@ -62,6 +62,7 @@ pub struct Loss {
     need_opaque: u32,
     n_rays: u32,
     n_samples: u32,
+    subgroup_size: u64,
 }
 
 impl Loss {
@@ -92,9 +93,10 @@ impl Loss {
                 &Surface::field_shape(config).without_gradient(),
                 2 * n_rays,
                 0,
-            )?,
+            )?
+            .going_back(n_rays),
             query_sdf: gpu.scratch("bias sdf", 2 * n)?,
-            d_query_sdf: gpu.scratch("bias d_sdf", 2 * n)?,
+            d_query_sdf: gpu.scratch("bias d_sdf", n)?,
             tangent: Tangent::new(gpu, config, n_rays * n_samples)?,
             supervision: Supervision::new(gpu, config, n_rays, priors)?,
             squared: config.loss.color_squared as f32,
@@ -111,6 +113,7 @@ impl Loss {
             need_opaque: u32::from(!config.surface.inside_out),
             n_rays,
             n_samples,
+            subgroup_size: gpu.info().subgroup_size.into(),
         };
         gpu.upload(&loss.terms, 0, &loss.terms_of(config, renderer))?;
         Ok(loss)
@@ -154,13 +157,14 @@ impl Loss {
             offset: self.offset,
             need_opaque: self.need_opaque,
         };
-        let samples = f64::from(self.n_samples);
-        // One subgroup a ray, whatever its size: the kernel strides over the rays.
+        // Eight bytes and about as many operations a sample, shared by a subgroup's lanes.
+        let share = 8.0 * f64::from(self.n_samples) / self.subgroup_size as f64;
+        // One subgroup a ray; where its size varies, the kernel strides over the rays.
         rec.run(
             &self.heaviest_sample,
-            Work::items(u64::from(self.n_rays) * 64)
-                .flops(samples / 8.0)
-                .bytes(samples / 8.0),
+            Work::items(u64::from(self.n_rays) * self.subgroup_size)
+                .flops(share)
+                .bytes(share),
             args,
         );
     }

@@ -13,6 +13,8 @@ pub struct FieldBuffers {
     pub n: u32,
     /// Leading points whose hidden activations are kept for further heads.
     pub n_hidden: u32,
+    /// Leading points that go back through the field.
+    pub(super) n_back: u32,
     pub inputs: Buffer<f32>, // [inputs, n]
     /// [hidden, n_hidden]; in the backward pass the heads put its gradient in its place.
     pub hidden: Activations,
@@ -58,10 +60,16 @@ impl FieldBuffers {
         Ok(FieldBuffers {
             n,
             n_hidden,
+            n_back: n,
             inputs: planes("inputs", shape.inputs())?,
             hidden: Activations::new(gpu, &format!("{name} hidden"), shape.hidden, n_hidden)?,
             slope,
         })
+    }
+
+    /// The same, where a loss only compares what the field says of the points behind the leading `n_back`.
+    pub fn going_back(self, n_back: u32) -> Self {
+        FieldBuffers { n_back, ..self }
     }
 
     /// The gradient's buffers.
