@@ -287,7 +287,7 @@ fn one_run(
         let place = &run.run;
         let pictures = score(
             place,
-            None,
+            Some(&args.dataset),
             Which::Test,
             appearance,
             context,

@@ -169,7 +169,8 @@ impl Planned<'_> {
 /// What of a dataset differs between two runs, in words.
 fn changes(was: &SceneRecord, now: &SceneRecord) -> Vec<String> {
     let mut told = Vec::new();
-    if was.dataset != now.dataset {
+    // One that is no longer where it was has moved here, if it holds the same.
+    if was.dataset != now.dataset && was.dataset.exists() {
         let (was, now) = (was.dataset.display(), now.dataset.display());
         told.push(format!("dataset: {was} -> {now}"));
     }

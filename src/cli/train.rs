@@ -355,8 +355,11 @@ fn resume(args: &TrainArgs, out: &Path, context: &Context) -> anyhow::Result<Tas
         config.total_steps(),
         latest.checkpoint.path().display()
     ));
-    let record = SceneRecord::load(&run)?;
+    let mut record = SceneRecord::load(&run)?;
     let scene = record.open(args.dataset.as_deref(), &config)?;
+    if let Some(moved) = &args.dataset {
+        record.move_to(moved)?;
+    }
     let gpu = context.gpu_with(gpu_options(&config))?;
     let mut trainer = Trainer::new(&gpu, &scene, &state.region, &config)?;
     trainer.restore(&latest.checkpoint)?;

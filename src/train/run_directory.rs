@@ -220,6 +220,10 @@ pub struct ViewRecord {
     pub height: u32,
 }
 
+fn absolute(dataset: &Path) -> Result<PathBuf> {
+    fs::canonicalize(dataset).map_err(|error| Error::unreadable(dataset, &error))
+}
+
 /// How a configuration reads its dataset.
 pub fn scene_options(config: &Config) -> SceneOptions {
     SceneOptions {
@@ -237,8 +241,7 @@ impl SceneRecord {
     pub fn new(dataset: &Path, scene: &Scene, region: &Region) -> Result<SceneRecord> {
         let rows = region.world_from_region().transpose().to_cols_array_2d();
         Ok(SceneRecord {
-            dataset: fs::canonicalize(dataset)
-                .map_err(|error| Error::unreadable(dataset, &error))?,
+            dataset: absolute(dataset)?,
             format: scene.format,
             region: region.clone(),
             world_from_region: rows,
@@ -266,6 +269,15 @@ impl SceneRecord {
         };
         let text = fs::read_to_string(&path).map_err(|error| unusable(error.to_string()))?;
         serde_json::from_str(&text).map_err(|error| unusable(error.to_string()))
+    }
+
+    /// Remembers where the dataset is now.
+    ///
+    /// # Errors
+    /// [`Error::Input`] if the path cannot be resolved.
+    pub fn move_to(&mut self, dataset: &Path) -> Result<()> {
+        self.dataset = absolute(dataset)?;
+        Ok(())
     }
 
     /// Opens the dataset again, here or at `moved`, as `config` says.

@@ -186,6 +186,15 @@ fn a_run_from_photographs_to_mesh() {
     assert!(result["rows"][0]["launches"].as_u64().unwrap() >= 3);
     let trace: Value = serde_json::from_str(&fs::read_to_string(trace).unwrap()).unwrap();
     assert!(trace["traceEvents"].as_array().unwrap().len() > 30);
+
+    // Photographs that have moved are named once.
+    let moved = path("moved");
+    fs::rename(&photos, &moved).unwrap();
+    fails(&["eval", &out], 3, &["no longer there", "--dataset"]);
+    let resumed = run(&["train", &moved, "--out", &out, "--resume"]);
+    assert_eq!(resumed.code, Some(0), "{}", resumed.stderr);
+    let scored = run(&["eval", &out]);
+    assert_eq!(scored.code, Some(0), "{}", scored.stderr);
 }
 
 /// The first interrupt saves and exits 130, and the run goes on from exactly there.

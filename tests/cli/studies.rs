@@ -204,6 +204,23 @@ fn runs_that_were_trained_otherwise_are_not_compared() {
     let finer = compare(&["--steps", "8", "--resolution", "32"]);
     assert_eq!(finer.code, Some(0), "{}", finer.stderr);
     assert!(finer.stderr.contains("scored again"), "{}", finer.stderr);
+
+    // Photographs that are no longer where they were have moved; beside those, a copy is another dataset.
+    let elsewhere = path("elsewhere");
+    write_dataset(Path::new(&elsewhere));
+    let at_elsewhere = || {
+        let mut words = words(&small);
+        words[1].clone_from(&elsewhere);
+        let words: Vec<&str> = words.iter().map(String::as_str).collect();
+        said(neurodin(&words).output().unwrap())
+    };
+    let copy = at_elsewhere();
+    assert_eq!(copy.code, Some(3), "{}", copy.stderr);
+    assert!(copy.stderr.contains("dataset: "), "{}", copy.stderr);
+    std::fs::remove_dir_all(&photos).unwrap();
+    let moved = at_elsewhere();
+    assert_eq!(moved.code, Some(0), "{}", moved.stderr);
+    assert!(moved.stderr.contains("scored again"), "{}", moved.stderr);
 }
 
 /// Points all over the unit sphere.
