@@ -3,11 +3,13 @@
 use glam::{DMat4, DVec3};
 use neurodin::config::Config;
 use neurodin::gpu::{Gpu, GpuOptions};
+use neurodin::mesh::Field;
 use neurodin::scene::{Region, RegionShape, Scene, SceneOptions};
 use neurodin::train::Trainer;
 use neurodin::train::checkpoint::Checkpoint;
 use neurodin::train::report::{Control, Event};
-use neurodin::train::run_directory::RunDirectory;
+use neurodin::train::run_directory::{RunDirectory, SceneRecord};
+use neurodin::train::trained::Trained;
 use std::fs;
 use std::path::Path;
 
@@ -94,6 +96,33 @@ fn restored_takes_the_same_next_step(config: &Config) {
         first.values.iter().all(|value| value.is_finite()),
         "{first:?}"
     );
+}
+
+#[test]
+fn an_opened_run_looks_up_its_own_table_in_float16() {
+    let config = of_every_kind().with_assignment("hash.half=true").unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let (scene, region) = (scene(folder.path()), sphere(1.1));
+    let gpu = Gpu::new(&GpuOptions::default()).unwrap();
+    let mut trainer = Trainer::new(&gpu, &scene, &region, &config).unwrap();
+    for _ in 0..6 {
+        trainer.step().unwrap();
+    }
+    let run = RunDirectory::create(&folder.path().join("run"), false).unwrap();
+    trainer.save(&run.checkpoints()).unwrap();
+    let record = SceneRecord::new(folder.path(), &scene, &region).unwrap();
+    run.write(&run.scene(), &record.to_json()).unwrap();
+    let trained = Trained::open(&gpu, &run).unwrap();
+
+    let points: Vec<[f32; 3]> = (0..200u8)
+        .map(|i| [7u8, 31, 83].map(|prime| f32::from(i.wrapping_mul(prime)) / 160.0 - 0.8))
+        .collect();
+    let ask = |model, now| {
+        let mut field = Field::new(&gpu, &config, model, now).unwrap();
+        field.sdf(&points).unwrap()
+    };
+    let was = ask(trainer.model(), trainer.annealed());
+    assert_eq!(ask(&trained.model, trained.annealed()), was);
 }
 
 /// Every kind of parameter there is: codes, a background field, both proposals, and a table of which a step leaves a part alone.
