@@ -215,7 +215,7 @@ pub struct SurfaceConfig {
     pub tap_step: TapStepKind,
     /// Random taps lie U(0, tap_range) away, floored at a quarter of the finest cell of [0, 1]³.
     pub tap_range: f64,
-    /// What the range has become by the end of the schedule, by equal factors in equal times.
+    /// What the range has become by the end of the schedule, by equal factors in equal times; 0 where it stays what it is.
     pub tap_range_end: f64,
 }
 

@@ -69,12 +69,10 @@ impl Config {
             wrong.add("surface.taps", self.surface.taps, "4 or 6");
         }
         wrong.real("surface.tap_range", self.surface.tap_range, 1e-6, 1.0);
-        wrong.real(
-            "surface.tap_range_end",
-            self.surface.tap_range_end,
-            1e-6,
-            1.0,
-        );
+        let range_end = self.surface.tap_range_end;
+        if range_end != 0.0 {
+            wrong.real("surface.tap_range_end", range_end, 1e-6, 1.0);
+        }
         wrong.real(
             "loss.curvature.weight",
             self.loss.curvature.weight,

@@ -100,8 +100,10 @@ impl Schedule {
         let growth = growth(hash);
         let (tap_range, tap_floor) = match surface.tap_step {
             TapStepKind::Random => {
-                let x = k / *schedule_steps as f64;
-                let range = exponential(surface.tap_range, surface.tap_range_end, x);
+                let range = match surface.tap_range_end {
+                    0.0 => surface.tap_range,
+                    end => exponential(surface.tap_range, end, k / *schedule_steps as f64),
+                };
                 (range, 0.25 / f64::from(hash.max))
             }
             TapStepKind::Level => {
@@ -227,14 +229,17 @@ mod tests {
         }
     }
 
-    /// By equal factors in equal times; the published range stays what it is.
+    /// By equal factors in equal times; every preset's range stays what it is.
     #[test]
     fn the_range_of_taps_shrinks() {
-        let published = Schedule::new(&Config::default());
         let shrinking = Config::default().with_assignment("surface.tap_range_end=0.001");
         let shrinking = Schedule::new(&shrinking.unwrap());
         for (step, range) in [(0, 0.1), (150_000, 0.01), (300_000, 0.001)] {
-            assert_eq!(published.at(step).tap_range, 0.1);
+            for preset in PRESETS {
+                let config = Config::preset(preset.name).unwrap();
+                let now = Schedule::new(&config).at(step * config.steps / 300_000);
+                assert_eq!(now.tap_range, config.surface.tap_range, "{}", preset.name);
+            }
             assert!((shrinking.at(step).tap_range / range - 1.0).abs() < 1e-12);
         }
     }
