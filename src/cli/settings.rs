@@ -5,7 +5,7 @@ use crate::{Error, Result};
 use clap::Args;
 use std::path::PathBuf;
 
-/// Where settings come from, weakest first: preset, method, file, environment, flags.
+/// Where settings come from, weakest first: preset, file, method, environment, flags. A file that names a method is laid over that one.
 #[derive(Args, Clone, Debug, Default)]
 #[command(next_help_heading = "Settings")]
 pub(super) struct SettingsArgs {
@@ -66,9 +66,6 @@ impl SettingsArgs {
             Some(name) => Config::preset(name)?,
             None => base,
         };
-        if let Some(name) = &self.method {
-            config = config.with_method(name)?;
-        }
         if let Some(path) = &self.config {
             let source = path.display().to_string();
             let text =
@@ -81,6 +78,9 @@ impl SettingsArgs {
                     ..config.with_toml(&text, &source)?
                 },
             };
+        }
+        if let Some(name) = &self.method {
+            config = config.with_method(name)?;
         }
         for assignment in &self.set {
             config = config.with_assignment(assignment)?;

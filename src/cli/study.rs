@@ -48,6 +48,13 @@ impl<'a> Study<'a> {
                     .into(),
             });
         }
+        if let Some(method) = &settings.method {
+            return Err(Error::Config {
+                what: format!(
+                    "--method {method} (or NEURODIN_METHOD): several methods are trained here\n  next: leave it out; compare takes --methods"
+                ),
+            });
+        }
         Ok(Study {
             scene: open_scene(settings, flags, dataset)?,
             dataset,

@@ -5,7 +5,7 @@ use super::progress::{Progress, clock};
 use super::scene_args::SceneArgs;
 use super::settings::SettingsArgs;
 use super::{Context, diagnostics, interrupt};
-use crate::config::{Config, Effect};
+use crate::config::{Config, Difference, Effect};
 use crate::gpu::Gpu;
 use crate::scene::{Region, RegionShape, Scene, Split};
 use crate::train::Trainer;
@@ -15,6 +15,7 @@ use crate::train::run_directory::{RunDirectory, SceneRecord};
 use crate::{Error, Result};
 use clap::Args;
 use serde_json::{Value, json};
+use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
@@ -133,6 +134,7 @@ pub(super) fn train_or_resume(
 /// Everything a run needs, on the device, with nothing written yet.
 pub(super) struct Task {
     out: PathBuf,
+    /// Settings of all its stages.
     config: Config,
     scene: Scene,
     record: SceneRecord,
@@ -264,7 +266,12 @@ fn in_words(region: &Region) -> String {
 struct Resumed {
     run: RunDirectory,
     latest: Latest,
+    /// Settings of all its stages.
     config: Config,
+    /// Those of the stage in which it is.
+    stage: Config,
+    /// Changes to a stage that is over.
+    too_late: Vec<Difference>,
 }
 
 /// What there is to go on from, under the settings that were asked for now.
@@ -272,37 +279,74 @@ fn resumed(args: &TrainArgs, out: &Path) -> Result<Resumed> {
     let run = RunDirectory::open(out)?;
     let latest = checkpoint::latest(&run.checkpoints())?;
     let state = latest.checkpoint.state();
-    let mut was = state.config.clone();
-    let second_asked = args.settings.stage == Some(2);
-    let first_is_done = was.first_step == 0 && state.step == was.steps;
-    if first_is_done && (was.stage2.steps > 0 || second_asked) {
-        // The first stage keeps its length; one that was begun without a second now gets its preset's.
-        was.stage2.steps = match args.settings.steps {
-            Some(total) if total <= was.steps => {
-                return Err(Error::Config {
-                    what: format!(
-                        "--steps {total}: the first stage is done with its {} steps, which leaves none for the second\n  next: more --steps, or none \
-                         to keep what the run had",
-                        was.steps
-                    ),
-                });
-            }
-            Some(total) => total - was.steps,
-            None if second_asked && was.stage2.steps == 0 => {
-                Config::preset(&was.preset)?.stage2.steps
-            }
-            None => was.stage2.steps,
-        };
+    let mut was = settings_of_all_stages(&run, &state.config)?;
+    let first = was.steps;
+    let first_is_done = was.first_step == 0 && state.step >= first;
+    let refused = |what: String| Err(Error::Config { what });
+    match args.settings.stage {
+        Some(1) if state.config.first_step > 0 => {
+            return refused(format!(
+                "--stage 1: the run is in its second, after {} steps of the first\n  next: leave it out",
+                state.config.first_step
+            ));
+        }
+        Some(2) if was.first_step == 0 && !first_is_done => {
+            return refused(format!(
+                "--stage 2: {} of {first} steps of the first stage are done\n  next: go on with that, without --stage",
+                state.step
+            ));
+        }
+        // A run that was begun without a second stage now gets its preset's.
+        Some(2) if was.first_step == 0 && was.stage2.steps == 0 => {
+            was.stage2.steps = Config::preset(&was.preset)?.stage2.steps
+        }
+        _ => {}
     }
-    let config = args
+    let mut config = args
         .settings
-        .resolve(was)
+        .resolve(was.clone())
         .and_then(|config| args.scene.put_into(config))?;
+    if first_is_done && config.stage2.steps > 0 {
+        // What is done stays as long as it was: all other steps are the second stage's.
+        let total = config.total_steps();
+        if total <= first {
+            return refused(format!(
+                "--steps {total}: the first stage is done with its {first} steps, which leaves none for the second\n  next: more --steps, or none to \
+                 keep what the run had"
+            ));
+        }
+        (config.steps, config.stage2.steps) = (first, total - first);
+    }
+    let in_second = state.config.first_step > 0 && config.first_step == 0;
+    let stage = match in_second {
+        true => config.second_stage().unwrap_or_else(|| config.clone()),
+        false => config.clone(),
+    };
+    let now = state.config.differences(&stage);
+    let mut too_late = was.differences(&config);
+    too_late.retain(|of_all| {
+        in_second && of_all.key != "stage2.steps" && !now.iter().any(|one| one.key == of_all.key)
+    });
     Ok(Resumed {
         run,
         latest,
         config,
+        stage,
+        too_late,
     })
+}
+
+/// What the run's first stage was begun with, also when `now`, the settings of its newest checkpoint, are those of its second: flags that it
+/// was begun with are given again when it is gone on with, and mean the same.
+fn settings_of_all_stages(run: &RunDirectory, now: &Config) -> Result<Config> {
+    if now.first_step == 0 {
+        return Ok(now.clone());
+    }
+    let path = run.config();
+    let text = fs::read_to_string(&path).map_err(|error| Error::unreadable(&path, &error))?;
+    let all = Config::recorded(&text, &path.display().to_string())?;
+    let is_before = all.first_step == 0 && all.steps == now.first_step;
+    Ok(if is_before { all } else { now.clone() })
 }
 
 fn resume(args: &TrainArgs, out: &Path, context: &Context) -> anyhow::Result<Task> {
@@ -310,12 +354,14 @@ fn resume(args: &TrainArgs, out: &Path, context: &Context) -> anyhow::Result<Tas
         run,
         latest,
         config,
+        stage,
+        too_late,
     } = resumed(args, out)?;
     for refused in &latest.refused {
         context.warn(&refused.to_string());
     }
     let state = latest.checkpoint.state();
-    let differences = state.config.differences(&config);
+    let differences = state.config.differences(&stage);
     let refused: Vec<_> = differences
         .iter()
         .filter(|difference| difference.effect == Effect::Incompatible)
@@ -331,7 +377,7 @@ fn resume(args: &TrainArgs, out: &Path, context: &Context) -> anyhow::Result<Tas
         }
         .into());
     }
-    let end = config.first_step + config.steps;
+    let end = stage.first_step + stage.steps;
     if state.step > end {
         return Err(Error::Config {
             what: format!(
@@ -349,6 +395,11 @@ fn resume(args: &TrainArgs, out: &Path, context: &Context) -> anyhow::Result<Tas
             )),
         }
     }
+    for difference in &too_late {
+        context.warn(&format!(
+            "changed setting {difference}: without effect, the first stage is over"
+        ));
+    }
     context.say(&format!(
         "resume   {} of {} steps done, from {}",
         state.step,
@@ -361,7 +412,7 @@ fn resume(args: &TrainArgs, out: &Path, context: &Context) -> anyhow::Result<Tas
         record.move_to(moved)?;
     }
     let gpu = context.gpu_with(gpu_options(&config))?;
-    let mut trainer = Trainer::new(&gpu, &scene, &state.region, &config)?;
+    let mut trainer = Trainer::new(&gpu, &scene, &state.region, &stage)?;
     trainer.restore(&latest.checkpoint)?;
     say_device(&gpu, args.dry_run, context);
     diagnostics::note_checkpoint(latest.checkpoint.path());

@@ -32,6 +32,7 @@ impl fmt::Display for Difference {
 
 /// Groups and keys after whose change a checkpoint cannot be used.
 const INCOMPATIBLE: &[&str] = &[
+    "first_step",
     "scene.",
     "hash.levels",
     "hash.base",

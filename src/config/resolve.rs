@@ -159,7 +159,7 @@ impl Config {
     /// method with one stage, take all the steps of all stages.
     ///
     /// # Errors
-    /// [`Error::Config`] for an unknown name, with the nearest one.
+    /// [`Error::Config`] for an unknown name, with the nearest one, and where another method than NeuRodin has left its settings.
     pub fn with_method(self, name: &str) -> Result<Config> {
         let Some(method) = METHODS.iter().find(|method| method.name == name) else {
             let hint = match nearest(name, METHODS.iter().map(|method| method.name)) {
@@ -174,6 +174,18 @@ impl Config {
                 ),
             });
         };
+        if self.method == name {
+            return Ok(self);
+        }
+        if self.method != METHODS[0].name {
+            return Err(Error::Config {
+                what: format!(
+                    "method {name}: the settings are those of {} already\n  next: leave that method, and what it sets, out of the file or the run \
+                     that they come from",
+                    self.method
+                ),
+            });
+        }
         let (total, full_length) = (self.total_steps(), self.steps == self.schedule_steps);
         let table = Table::try_from(self).expect("a configuration is a table");
         let source = format!("method {name}");

@@ -231,6 +231,35 @@ fn settings_are_resolved_by_precedence() {
     );
     assert_eq!(table["seed"].as_integer(), Some(3));
     assert_eq!(table["hash"]["features"].as_integer(), Some(8));
+
+    // A method is what it is, whatever a file says of its preset or holds of NeuRodin's settings; one that the file names, it may change.
+    let print = ["train", "--print-config", "--config"];
+    let density = |table: &toml::Table| table["surface"]["density"].clone();
+    let named = printed(&mut neurodin(
+        &[&print[..], &[file, "--method", "neus-grid"]].concat(),
+    ));
+    assert_eq!(named["method"].as_str(), Some("neus-grid"));
+    assert_eq!(
+        (density(&named).as_str(), &named["rays"]),
+        (Some("neus"), &100.into())
+    );
+    let whole = folder.path().join("whole.toml");
+    let every_setting = run(&["train", "--print-config", "--preset", "indoor-tiny"]).stdout;
+    fs::write(&whole, every_setting).unwrap();
+    let whole = whole.to_str().unwrap();
+    let named = printed(&mut neurodin(
+        &[&print[..], &[whole, "--method", "neus-grid"]].concat(),
+    ));
+    assert_eq!(density(&named).as_str(), Some("neus"));
+    let own = folder.path().join("own.toml");
+    fs::write(&own, "method = 'neus-grid'\nsurface.scale_init = 0.5").unwrap();
+    let own = own.to_str().unwrap();
+    let named = printed(&mut neurodin(
+        &[&print[..], &[own, "--method", "neus-grid"]].concat(),
+    ));
+    assert_eq!(named["surface"]["scale_init"].as_float(), Some(0.5));
+    let other = [&print[..], &[own, "--method", "neurodin"]].concat();
+    fails(&other, 3, &["neurodin", "neus-grid already"]);
 }
 
 #[test]

@@ -77,9 +77,25 @@ fn a_run_from_photographs_to_mesh() {
         &["hash.levels: 4 -> 5", "next:"],
     );
     assert!(!refused.contains("panic"), "{refused}");
-    let longer = run(&["train", "--out", &out, "--resume", "--steps", "16"]);
+    // The same flags again mean the same, although the run is in its second stage by now.
+    let longer = ["--resume", "--steps", "16", "--set", "loss.eikonal=0.02"];
+    let longer = said(train(&longer).output().unwrap());
     assert_eq!(longer.code, Some(0), "{}", longer.stderr);
-    assert!(longer.stderr.contains("steps: 3 -> 7"), "{}", longer.stderr);
+    let told: Vec<&str> = (longer.stderr.lines())
+        .filter(|line| line.contains("changed setting"))
+        .collect();
+    assert_eq!(told.len(), 2, "{told:?}");
+    assert!(told[0].contains("steps: 3 -> 7"), "{told:?}");
+    assert!(
+        told[1].contains("loss.eikonal: 0.01 -> 0.02: without effect"),
+        "{told:?}"
+    );
+    let text = fs::read_to_string(run_folder.join("config.toml")).unwrap();
+    let kept: toml::Table = text.parse().unwrap();
+    assert_eq!(kept["steps"].as_integer(), Some(9));
+    assert_eq!(kept["stage2"]["steps"].as_integer(), Some(7));
+    let first = ["train", "--out", &out, "--resume", "--stage", "1"];
+    fails(&first, 3, &["--stage 1", "9 steps"]);
     assert_eq!(logged(&run_folder, "resumed")[0]["step"], 12);
 
     // A damaged checkpoint is refused, and the one before taken.
@@ -245,6 +261,8 @@ fn an_interrupted_run_is_saved_and_goes_on() {
         .expect("a checkpoint");
     let step = saved["step"].as_u64().unwrap();
     assert!(Path::new(saved["path"].as_str().unwrap()).is_file());
+    let second = ["train", "--out", &out, "--resume", "--stage", "2"];
+    fails(&second, 3, &["--stage 2", "of 1000000 steps"]);
     let resumed = run(&[
         "train",
         "--out",

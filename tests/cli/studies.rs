@@ -173,6 +173,7 @@ fn runs_that_were_trained_otherwise_are_not_compared() {
     // Whatever cannot be is said before anything is trained.
     let small = ["--steps", "8", "--resolution", "24"];
     refused(&["--stage", "2"], 3, "--stage 2");
+    refused(&["--method", "neus-grid"], 3, "--methods");
     refused(&["--set", "seed=4294967295", "--seeds", "2"], 3, "seed");
     refused(&["--report", "no/such/r.html"], 8, "mkdir");
     std::fs::write(&page, "precious").unwrap();
