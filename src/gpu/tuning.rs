@@ -17,7 +17,7 @@ pub(super) struct Tuning {
     file: Option<PathBuf>,
 }
 
-/// Answers by question, as names of ways.
+/// Answers by what was asked ([`asked`]), as names of ways.
 type Answers = BTreeMap<String, String>;
 
 /// The file's contents.
@@ -37,6 +37,13 @@ fn kernels_at_hand() -> String {
         by_matrices.hash(&mut hasher);
     }
     format!("{:016x}", hasher.finish())
+}
+
+/// A question together with the ways it was asked of, in any order: the fastest of some need not be the fastest where there are others.
+fn asked(question: &str, ways: &[String]) -> String {
+    let mut ways = ways.to_vec();
+    ways.sort();
+    format!("{question}: {}", ways.join(" | "))
 }
 
 /// A way takes the place of the first where it needs no more than this share of its time: less of a difference is noise.
@@ -107,7 +114,8 @@ impl Gpu {
         }
         let tuning = &self.inner.tuning;
         let mut answers = tuning.answers.lock().expect("no panic under the lock");
-        let known = answers.get(question);
+        let asked = asked(question, ways);
+        let known = answers.get(&asked);
         if let Some(way) = known.and_then(|known| ways.iter().position(|way| way == known)) {
             return Ok(way);
         }
@@ -122,7 +130,7 @@ impl Gpu {
         let better = fastest.filter(|&way| seconds[way] < WORTH * seconds[0]);
         let chosen = better.unwrap_or(0);
         tracing::info!(question, way = ways[chosen], "tuning answer measured");
-        answers.insert(question.into(), ways[chosen].clone());
+        answers.insert(asked, ways[chosen].clone());
         // An answer that cannot be kept costs time at the next start, and nothing else.
         if let Err(error) = tuning.save(&answers) {
             tracing::info!(%error, "tuning answers not written");

@@ -53,6 +53,12 @@ fn the_fastest_way_is_found_once() -> Result<()> {
         (1, true),
         "a new way is tried"
     );
+    assert_eq!(
+        ask(&again, ["another", "short"])?,
+        (1, true),
+        "the fastest of others is no answer"
+    );
+    assert_eq!(ask(&again, ways)?, (1, false), "nor is that one forgotten");
     // What was measured with other kernels is no answer.
     let file = std::fs::read_dir(folder.path().join("cache"))
         .expect("the folder of the cache")
