@@ -28,6 +28,8 @@ void main() {
     uint row = gl_LocalInvocationID.x;
     uint now = clock.at[0];
     bool bad = bad_step.at[0] != 0u;
+    // Everybody has read the clock before it goes on: by itself, a barrier orders shared memory alone.
+    memoryBarrierBuffer();
     barrier();
     if (row < LEVELS) {
         LevelUse use = uses.at[row];
