@@ -35,6 +35,7 @@ layout(push_constant, scalar) uniform Args {
     uint stride_hidden;
     uint begin;          // the points of this launch
     uint end;
+    uint points_each;    // of an invocation of PART 1
 };
 
 // Three derivatives of a feature, from a row on.
@@ -63,13 +64,13 @@ void encode(Level level, uint l, Item item) {
     if (COORDINATES != 0u && l == 0u) set_vector(inputs, point, n, x);
 }
 
-// The same of this workgroup's share of the points.
+// The same of this workgroup's share of the points. (How many those are cannot be told from the number of workgroups: a long launch comes in
+// parts, each with a number of its own.)
 void encode_level() {
-    uint l = level_of_slice(LEVELS), groups = gl_NumWorkGroups.x * gl_NumWorkGroups.y;
+    uint l = level_of_slice(LEVELS), turns = points_each;
     Level level = levels.at[l];
     uint words_of_entry = HALF != 0u ? FEATURES / 2u : FEATURES;
     uint n_words = level.entries * words_of_entry;
-    uint turns = (end - begin + groups * LOCAL_SIZE - 1u) / (groups * LOCAL_SIZE);
     // Where there are many workgroups, they have one turn each, and share a cache.
     if (turns > 1u && read_through(table, level.offset * words_of_entry, n_words, turns * LOCAL_SIZE) > n_words) return;  // never
     uint first = begin + first_of_subgroup(turns);

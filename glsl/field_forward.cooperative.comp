@@ -30,6 +30,7 @@ layout(push_constant, scalar) uniform Args {
     uint stride_hidden;
     uint begin;          // the points of this launch
     uint end;
+    uint points_each;    // PART 1 alone
 };
 
 uint first_neuron;

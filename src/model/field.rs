@@ -420,7 +420,6 @@ impl Field {
         points: Ptr<f32>,
         buffers: &FieldBuffers,
     ) {
-        let args = self.forward_args(params, points, buffers, PtrMut::NULL, 0..buffers.n);
         let levels = f64::from(self.shape.grid.levels);
         let mut flops = self.interpolation_flops();
         let mut bytes = self.gather_bytes() + self.row_bytes();
@@ -434,6 +433,10 @@ impl Field {
         let turns = match self.few_cores {
             true => buffers.n.div_ceil(ENCODERS * kernel.local_size()).max(1),
             false => 1,
+        };
+        let args = field_forward::Args {
+            points_each: turns,
+            ..self.forward_args(params, points, buffers, PtrMut::NULL, 0..buffers.n)
         };
         let work = Work::items(buffers.n.into())
             .turns(turns.into())
@@ -471,6 +474,7 @@ impl Field {
             stride_hidden: buffers.hidden.stride,
             begin: launch.start,
             end: launch.end,
+            points_each: 1,
         }
     }
 

@@ -4,7 +4,8 @@
 use crate::half_copy::cut;
 use crate::harness::assert_gradient;
 use neurodin::Result;
-use neurodin::gpu::{Gpu, GpuOptions};
+use neurodin::gpu::{Gpu, GpuOptions, Ptr, PtrMut, Work};
+use neurodin::kernels::field_forward;
 use neurodin::model::{
     Field, FieldBuffers, FieldShape, Group, HashGrid, Init, Params, ParamsPlan, Scratch, layer_ways,
 };
@@ -245,6 +246,63 @@ fn a_copy_in_float16_is_the_same_table() -> Result<()> {
         half.1.refresh_copy(gpu)?;
         let of_nothing = backward(gpu, &half, range.clone())?;
         assert_ne!(of_nothing, got, "a copy that is made again");
+    }
+    assert_valid(gpu);
+    Ok(())
+}
+
+/// The recorder cuts a long launch into parts: each encodes its own points, and does not begin with those of the others.
+#[test]
+fn a_part_of_a_launch_encodes_its_own_points() -> Result<()> {
+    let gpu = &open(&[])?;
+    let grid = SHAPE.grid;
+    let shape = field_forward::Shape {
+        levels: grid.levels,
+        features: grid.features,
+        coordinates: 0,
+        part: 1,
+        ..field_forward::Shape::default()
+    };
+    let kernel = gpu.kernel(shape)?;
+    let rows = grid.level_table();
+    let levels = gpu.buffer("levels", rows.len() as u64)?;
+    gpu.upload(&levels, 0, &rows)?;
+    let table = gpu.buffer::<u32>("table", grid.entries() * u64::from(grid.features))?;
+    let (n, of_part) = (4 * kernel.local_size(), 2 * kernel.local_size());
+    let points = gpu.buffer::<f32>("points", 3 * u64::from(n))?;
+    let inputs = gpu.scratch::<f32>("inputs", u64::from(grid.outputs() * n))?;
+    gpu.submit("part", |rec| {
+        let args = field_forward::Args {
+            levels: levels.ptr(),
+            table: table.ptr(),
+            hidden_weight: Ptr::NULL,
+            hidden_bias: Ptr::NULL,
+            head_weight: Ptr::NULL,
+            head_bias: Ptr::NULL,
+            points: points.ptr(),
+            inputs: inputs.ptr_mut(),
+            hidden: PtrMut::NULL,
+            first: PtrMut::NULL,
+            derivatives: PtrMut::NULL,
+            n,
+            n_hidden: 0,
+            stride_hidden: 0,
+            begin: 0,
+            end: n,
+            points_each: 1,
+        };
+        rec.run(
+            &kernel,
+            Work::items(of_part.into()).slices(grid.levels),
+            args,
+        );
+        Ok(())
+    })?;
+    let inputs = gpu.download(&inputs, 0, inputs.len())?;
+    for row in inputs.chunks_exact(n as usize) {
+        let (part, rest) = row.split_at(of_part as usize);
+        assert!(part.iter().all(|&x| x == 0.0), "a point that is left out");
+        assert!(rest.iter().all(|x| x.is_nan()), "another part's point");
     }
     assert_valid(gpu);
     Ok(())
