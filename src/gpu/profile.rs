@@ -73,18 +73,37 @@ pub(super) struct Stamps {
 /// Clock and tables.
 pub(super) struct Profiler {
     opened: Instant,
-    /// Nanoseconds per tick, and the bits of a timestamp that count.
+    /// Nanoseconds per tick, and how many bits of a timestamp count.
     period: f64,
-    mask: u64,
+    valid_bits: u32,
     tables: Mutex<Tables>,
 }
 
 #[derive(Default)]
 struct Tables {
-    /// A timestamp, and what the host's clock said then.
-    base: Option<(u64, i64)>,
+    ticks: Ticks,
+    /// What the host's clock said at the first timestamp.
+    first_ns: i64,
     rows: HashMap<Arc<str>, Row>,
     events: Vec<Event>,
+}
+
+/// The device's clock, which begins again behind its last bit: read on past it.
+#[derive(Default)]
+struct Ticks {
+    last: Option<u64>,
+    since_first: i64,
+}
+
+impl Ticks {
+    /// From the first timestamp to this one, less than half a round of the clock before or after the last one.
+    fn at(&mut self, stamp: u64, valid_bits: u32) -> i64 {
+        let step = stamp.wrapping_sub(self.last.unwrap_or(stamp));
+        let unused = u64::BITS - valid_bits;
+        self.since_first += (step << unused) as i64 >> unused;
+        self.last = Some(stamp);
+        self.since_first
+    }
 }
 
 #[derive(Default)]
@@ -96,18 +115,17 @@ struct Row {
 
 impl Profiler {
     pub(super) fn new(info: &DeviceInfo, valid_bits: u32) -> Profiler {
-        let mask = u64::MAX.checked_shr(64 - valid_bits).unwrap_or(0);
         Profiler {
             opened: Instant::now(),
             period: info.timestamp_period,
-            mask,
+            valid_bits,
             tables: Mutex::default(),
         }
     }
 
     /// Refuses where the device has no clock.
     pub(super) fn check(&self, info: &DeviceInfo) -> Result<()> {
-        match self.mask {
+        match self.valid_bits {
             0 => Err(Error::NoDevice {
                 what: format!(
                     "{} has no timestamps, so it cannot be profiled\n  next: run without",
@@ -121,7 +139,12 @@ impl Profiler {
     /// Reads the timestamps of a call that is done.
     pub(super) fn take(&self, device: &ash::Device, stamps: &mut Stamps) -> Result<()> {
         let mut tables = self.tables.lock().expect("no panic under the lock");
-        let Tables { base, rows, events } = &mut *tables;
+        let Tables {
+            ticks,
+            first_ns,
+            rows,
+            events,
+        } = &mut *tables;
         let mut entries = stamps.entries.drain(..);
         let mut times = Vec::new();
         for pool in &stamps.pools {
@@ -143,11 +166,9 @@ impl Profiler {
                 if there == 0 || there_too == 0 {
                     continue; // recorded, never submitted: the recording failed
                 }
-                let &mut (first_tick, first_ns) = base.get_or_insert((begin, 0));
-                let ns = |tick: u64| {
-                    first_ns + (tick.wrapping_sub(first_tick) as i64 as f64 * self.period) as i64
-                };
-                let ms = (end.wrapping_sub(begin) & self.mask) as f64 * self.period * 1e-6;
+                let [begin, end] = [begin, end].map(|stamp| ticks.at(stamp, self.valid_bits));
+                let ns = |ticks: i64| *first_ns + (ticks as f64 * self.period) as i64;
+                let ms = (end - begin) as f64 * self.period * 1e-6;
                 let row = rows.entry(entry.row.clone()).or_default();
                 match row.ms.last_mut() {
                     Some(last) if !entry.first => *last += ms as f32,
@@ -288,8 +309,8 @@ impl Gpu {
             .tables
             .lock()
             .expect("no panic under the lock");
-        if let (Some((stamp, (sent, there))), Some((_, ns))) = (shortest, &mut tables.base) {
-            *ns = (sent + there) / 2 - stamp.begin_ns;
+        if let Some((stamp, (sent, there))) = shortest {
+            tables.first_ns = (sent + there) / 2 - stamp.begin_ns;
         }
         Ok(())
     }
@@ -309,6 +330,27 @@ impl Row {
             max_ms: at(sorted.len().saturating_sub(1)),
             flops: self.flops,
             bytes: self.bytes,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_clock_that_begins_again_goes_on() {
+        for valid_bits in [36, 64] {
+            let last = u64::MAX >> (u64::BITS - valid_bits);
+            let third = (last / 3) as i64;
+            // Over the end, a little back, and on; with few bits for some rounds.
+            let rounds = (1..10).map(|k| k * third);
+            let long = rounds.take_while(|_| valid_bits < 64);
+            let mut ticks = Ticks::default();
+            for since_first in [0, 5, 9, 3, 12].into_iter().chain(long) {
+                let stamp = (last - 7).wrapping_add_signed(since_first) & last;
+                assert_eq!(ticks.at(stamp, valid_bits), since_first);
+            }
         }
     }
 }
