@@ -29,6 +29,8 @@ pub struct GpuOptions {
     pub profile: bool,
     /// Ignores what only some devices offer, so that the variants run that run everywhere.
     pub portable: bool,
+    /// Takes the device for one with many cores, so that what runs on GPUs runs on a software device.
+    pub many_cores: bool,
     /// Adds gradients up so that their order does not count: the same run comes out in the same bits, on one device. Needs 64-bit
     /// atomics, which `portable` leaves out.
     pub deterministic: bool,
@@ -122,11 +124,13 @@ impl Gpu {
         // What the device has, before what is not to be used of it is taken away.
         let has_matrix = info.matrix.is_some();
         let has_int64 = info.int64 && info.int64_atomics;
+        if options.portable || options.many_cores {
+            info.few_cores = false;
+            info.lanes_at_once = 0;
+        }
         if options.portable {
             info.float_atomics = false;
             info.int64 = false;
-            info.few_cores = false;
-            info.lanes_at_once = 0;
             info.full_subgroups = None;
             info.matrix = None;
         }

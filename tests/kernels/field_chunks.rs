@@ -47,12 +47,11 @@ fn planes(of: u32, rows: usize, scale: f32, range: std::ops::Range<usize>) -> Ve
 }
 
 /// A device of this test's own, so that all buffers that live have their guard words.
-fn open(ways: &[String]) -> Result<Gpu> {
+fn open(options: GpuOptions) -> Result<Gpu> {
     Gpu::new(&GpuOptions {
         validation: true,
         guard: true,
-        ways: ways.to_vec(),
-        ..GpuOptions::default()
+        ..options
     })
 }
 
@@ -157,7 +156,17 @@ fn assert_gradients(params: &Params, got: &[f64], want: &[f64]) {
 
 #[test]
 fn many_points_are_the_sum_of_fewer() -> Result<()> {
-    let gpu = &open(&[])?;
+    for many_cores in [false, true] {
+        sum_up(GpuOptions {
+            many_cores,
+            ..GpuOptions::default()
+        })?;
+    }
+    Ok(())
+}
+
+fn sum_up(options: GpuOptions) -> Result<()> {
+    let gpu = &open(options)?;
     let (whole, parts) = (field(gpu, SHAPE)?, field(gpu, SHAPE)?);
     let d_points = backward(gpu, &whole, 0..POINTS)?;
     let cut = 40_000;
@@ -183,7 +192,7 @@ fn many_points_are_the_sum_of_fewer() -> Result<()> {
 /// Fewer points than a subgroup has lanes, and not many more, with heads and without.
 #[test]
 fn a_few_points_are_the_sum_of_each() -> Result<()> {
-    let gpu = &open(&[])?;
+    let gpu = &open(GpuOptions::default())?;
     let shape = FieldShape { kept: 2, ..SHAPE };
     let (whole, alone) = (field(gpu, shape)?, field(gpu, shape)?);
     let range = WITH_HEADS - 19..WITH_HEADS + 5;
@@ -202,7 +211,7 @@ fn a_few_points_are_the_sum_of_each() -> Result<()> {
 
 #[test]
 fn derivatives_that_are_kept_are_those_looked_up() -> Result<()> {
-    let gpu = &open(&[])?;
+    let gpu = &open(GpuOptions::default())?;
     let keeping = |kept| field(gpu, FieldShape { kept, ..SHAPE });
     // Both halves of a pass that is cut.
     let range = 1..POINTS;
@@ -223,7 +232,7 @@ fn derivatives_that_are_kept_are_those_looked_up() -> Result<()> {
 /// Every look-up reads the copy: the table itself may be gone.
 #[test]
 fn a_copy_in_float16_is_the_same_table() -> Result<()> {
-    let gpu = &open(&[])?;
+    let gpu = &open(GpuOptions::default())?;
     let range = 0..5_001;
     for kept in [0, 2] {
         let shape = FieldShape { kept, ..SHAPE };
@@ -254,7 +263,7 @@ fn a_copy_in_float16_is_the_same_table() -> Result<()> {
 /// The recorder cuts a long launch into parts: each encodes its own points, and does not begin with those of the others.
 #[test]
 fn a_part_of_a_launch_encodes_its_own_points() -> Result<()> {
-    let gpu = &open(&[])?;
+    let gpu = &open(GpuOptions::default())?;
     let grid = SHAPE.grid;
     let shape = field_forward::Shape {
         levels: grid.levels,
@@ -310,14 +319,17 @@ fn a_part_of_a_launch_encodes_its_own_points() -> Result<()> {
 
 #[test]
 fn straight_line_code_is_the_same_field() -> Result<()> {
-    let loops = &open(&[])?;
+    let loops = &open(GpuOptions::default())?;
     let ways = layer_ways(loops, SHAPE.hidden).into_iter();
     let ways: Vec<String> = ways.filter(|way| way.starts_with("straight")).collect();
     if ways.is_empty() {
         println!("skipped: this device is none for straight-line code");
         return Ok(());
     }
-    let straight = &open(&ways)?;
+    let straight = &open(GpuOptions {
+        ways,
+        ..GpuOptions::default()
+    })?;
     // Points with heads and without, of both a number that leaves a workgroup's last invocations without work.
     let range = WITH_HEADS - 501..WITH_HEADS + 407;
     let (of_loops, of_straight) = (field(loops, SHAPE)?, field(straight, SHAPE)?);

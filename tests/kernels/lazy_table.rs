@@ -77,14 +77,13 @@ fn corners(point: [f32; 3]) -> Vec<usize> {
 
 impl Bench {
     /// `half`: with a copy of the table in float16.
-    fn new(features: u32, decay: f64, portable: bool, half: bool) -> Result<Bench> {
+    fn new(features: u32, decay: f64, half: bool, options: GpuOptions) -> Result<Bench> {
         let grid = HashGrid { features, ..GRID };
         let of_entry = features as usize;
         let gpu = Gpu::new(&GpuOptions {
             validation: true,
             guard: true,
-            portable,
-            ..GpuOptions::default()
+            ..options
         })?;
         let mut optimizer = Config::default().optimizer;
         optimizer.table.weight_decay = decay;
@@ -332,8 +331,8 @@ fn batch_of(step: u64, random: &mut Random) -> usize {
     }
 }
 
-fn ten_thousand_steps(features: u32, decay: f64, portable: bool, half: bool) -> Result<()> {
-    let mut bench = Bench::new(features, decay, portable, half)?;
+fn ten_thousand_steps(features: u32, decay: f64, half: bool, options: GpuOptions) -> Result<()> {
+    let mut bench = Bench::new(features, decay, half, options)?;
     let used: BTreeSet<usize> = bench
         .batches
         .iter()
@@ -374,17 +373,31 @@ fn too_short_a_memory_has_no_closed_form() -> Result<()> {
 
 #[test]
 fn ten_thousand_steps_are_those_of_adamw() -> Result<()> {
-    ten_thousand_steps(8, 0.01, false, false)
+    ten_thousand_steps(8, 0.01, false, GpuOptions::default())
 }
 
 #[test]
 fn ten_thousand_steps_without_decay_by_the_portable_kernels_with_a_copy() -> Result<()> {
-    ten_thousand_steps(2, 0.0, true, true)
+    let portable = GpuOptions {
+        portable: true,
+        ..GpuOptions::default()
+    };
+    ten_thousand_steps(2, 0.0, true, portable)
 }
 
 #[test]
 fn what_is_touched_is_up_to_date_before_it_is_read() -> Result<()> {
-    let mut bench = Bench::new(2, 0.01, false, false)?;
+    for many_cores in [false, true] {
+        touch_before_reading(GpuOptions {
+            many_cores,
+            ..GpuOptions::default()
+        })?;
+    }
+    Ok(())
+}
+
+fn touch_before_reading(options: GpuOptions) -> Result<()> {
+    let mut bench = Bench::new(2, 0.01, false, options)?;
     let gpu = bench.gpu.clone();
     let mut random = Random(5);
     for first in (0..600u64).step_by(30) {
@@ -418,7 +431,7 @@ fn what_is_touched_is_up_to_date_before_it_is_read() -> Result<()> {
 /// A checkpoint holds a flushed table: going on with it and going on from it are the same to the last bit.
 #[test]
 fn a_flushed_table_goes_on_like_an_uploaded_one() -> Result<()> {
-    let mut bench = Bench::new(4, 0.01, false, false)?;
+    let mut bench = Bench::new(4, 0.01, false, GpuOptions::default())?;
     let gpu = bench.gpu.clone();
     let steps = |bench: &mut Bench, range: std::ops::Range<u64>, batches: usize| {
         let mut random = Random(range.start + 1);

@@ -133,6 +133,14 @@ fn portable() -> GpuOptions {
     }
 }
 
+/// What GPUs run.
+fn many_cores() -> GpuOptions {
+    GpuOptions {
+        many_cores: true,
+        ..usual()
+    }
+}
+
 /// Networks without loops, for devices that are slow in them.
 #[test]
 fn both_stages_by_straight_line_code() -> Result<()> {
@@ -222,6 +230,18 @@ fn outdoors_with_a_table_that_is_updated_in_part() -> Result<()> {
         config.hash.features = features;
         config.hash.log2_size = log2_size;
         check(config, RegionShape::Sphere, seed, usual())?;
+    }
+    Ok(())
+}
+
+/// The first stage's table is updated in part.
+#[test]
+fn both_stages_as_on_many_cores() -> Result<()> {
+    let mut first = preset("outdoor-tiny");
+    first.hash.features = 4;
+    first.hash.log2_size = 17;
+    for config in [first, second("outdoor-tiny")] {
+        check(config, RegionShape::Sphere, 9, many_cores())?;
     }
     Ok(())
 }
