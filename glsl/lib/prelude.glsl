@@ -78,6 +78,7 @@ uint item() { return group() * gl_WorkGroupSize.x + gl_LocalInvocationID.x; }
 // Where an invocation has k items: the first of its subgroup's first items, one for each of its invocations; the next ones follow at
 // distances of `items_abreast` (lib/abreast.glsl). A software device takes one subgroup through all of a loop before it begins with the
 // next: what a subgroup goes over lies side by side.
+// (gl_SubgroupSize is the subgroup's own, and no constant of the device, where pipelines may say so: Pipelines::build.)
 uint items_abreast() { return min(gl_SubgroupSize, LOCAL_SIZE); }
 uint first_of_subgroup(uint k) { return (group() * gl_NumSubgroups + gl_SubgroupID) * k * items_abreast(); }
 

@@ -27,7 +27,8 @@ pub struct GpuOptions {
     pub barrier_everywhere: bool,
     /// Times every launch. Launches are kept apart by barriers, so that a row's time is its own.
     pub profile: bool,
-    /// Ignores what only some devices offer, so that the variants run that run everywhere.
+    /// Ignores what only some devices offer, so that the variants run that run everywhere. (Full subgroups make no variant: they are asked
+    /// for where they can be.)
     pub portable: bool,
     /// Takes the device for one with many cores, so that what runs on GPUs runs on a software device.
     pub many_cores: bool,
@@ -131,7 +132,6 @@ impl Gpu {
         if options.portable {
             info.float_atomics = false;
             info.int64 = false;
-            info.full_subgroups = None;
             info.matrix = None;
         }
         let lacking = |has: bool, what: &str, next: &str| Error::NoDevice {

@@ -71,8 +71,8 @@ pub struct DeviceInfo {
     pub(super) cache_uuid: [u8; 16],
     pub(super) driver_version: u32,
     pub(super) vendor_device: (u32, u32),
-    /// (smallest, largest) subgroup size where full subgroups can be asked for.
-    pub(super) full_subgroups: Option<(u32, u32)>,
+    /// The largest subgroup size, where full subgroups can be asked for, whatever size they have.
+    pub(super) full_subgroups: Option<u32>,
 }
 
 /// Loader and instance, and under validation the messenger.
@@ -325,19 +325,18 @@ impl Instance {
             info.lanes_at_once = info.subgroup_size;
         }
         info.timestamp_period = limits.timestamp_period as f64;
-        if control.compute_full_subgroups != 0
-            && sizes
-                .required_subgroup_size_stages
-                .contains(vk::ShaderStageFlags::COMPUTE)
-        {
-            info.full_subgroups = Some((sizes.min_subgroup_size, sizes.max_subgroup_size));
+        if control.subgroup_size_control != 0 && control.compute_full_subgroups != 0 {
+            info.full_subgroups = Some(sizes.max_subgroup_size);
         }
 
+        let has_required_size =
+            (sizes.required_subgroup_size_stages).contains(vk::ShaderStageFlags::COMPUTE);
         let usable = matrices.cooperative_matrix != 0
             && twelve.shader_float16 != 0
             && twelve.vulkan_memory_model != 0
             && twelve.vulkan_memory_model_device_scope != 0
-            && info.full_subgroups.is_some();
+            && info.full_subgroups.is_some()
+            && has_required_size;
         if usable {
             info.matrix = self.matrix(physical, info.subgroup_size)?;
         }

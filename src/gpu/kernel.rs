@@ -246,15 +246,14 @@ impl Pipelines {
         let invocations: u32 = module.local_size.iter().product();
         let mut size = vk::PipelineShaderStageRequiredSubgroupSizeCreateInfo::default()
             .required_subgroup_size(info.subgroup_size);
+        let full = vk::PipelineShaderStageCreateFlags::REQUIRE_FULL_SUBGROUPS;
+        // Without it, gl_SubgroupSize is the device's largest even where a narrower subgroup runs, and who strides by it leaves items out.
+        let varying = vk::PipelineShaderStageCreateFlags::ALLOW_VARYING_SUBGROUP_SIZE;
         let flags = match info.full_subgroups {
-            _ if module.matrix_tile.is_some() => {
-                vk::PipelineShaderStageCreateFlags::REQUIRE_FULL_SUBGROUPS
-            }
-            Some((_, largest)) if module.local_size[0].is_multiple_of(largest) => {
-                vk::PipelineShaderStageCreateFlags::ALLOW_VARYING_SUBGROUP_SIZE
-                    | vk::PipelineShaderStageCreateFlags::REQUIRE_FULL_SUBGROUPS
-            }
-            _ => vk::PipelineShaderStageCreateFlags::empty(),
+            _ if module.matrix_tile.is_some() => full,
+            Some(largest) if module.local_size[0].is_multiple_of(largest) => varying | full,
+            Some(_) => varying,
+            None => vk::PipelineShaderStageCreateFlags::empty(),
         };
         let mut stage = vk::PipelineShaderStageCreateInfo::default()
             .flags(flags)
