@@ -351,7 +351,7 @@ impl Scene {
 
 /// What a dataset is known by.
 enum Layout {
-    /// transforms.json or transforms_train.json
+    /// transforms.json, transforms_train.json, or NeuS2's transform_train.json
     Transforms(PathBuf),
     /// meta_data.json
     Sdfstudio(PathBuf),
@@ -371,7 +371,12 @@ impl Layout {
             files.find(|file| file.is_file())
         };
         [
-            first(&["transforms.json", "transforms_train.json"]).map(Layout::Transforms),
+            first(&[
+                "transforms.json",
+                "transforms_train.json",
+                transforms::NEUS2,
+            ])
+            .map(Layout::Transforms),
             first(&["meta_data.json"]).map(Layout::Sdfstudio),
             first(&["cameras_sphere.npz", "cameras.npz"]).map(Layout::Neus),
             colmap::find_model(path).map(Layout::Colmap),
@@ -472,9 +477,9 @@ fn unrecognised(path: &Path) -> Error {
     Error::input(
         path,
         format!(
-            "no dataset here: neither transforms.json, transforms_train.json, meta_data.json, cameras_sphere.npz, cams/*_cam.txt, nor a \
-             COLMAP model (cameras, images and points3D as .bin or .txt) in sparse/0, sparse, colmap/sparse/0 or the directory itself; \
-             it holds {}",
+            "no dataset here: neither transforms.json, transforms_train.json, transform_train.json, meta_data.json, cameras_sphere.npz, \
+             cams/*_cam.txt, nor a COLMAP model (cameras, images and points3D as .bin or .txt) in sparse/0, sparse, colmap/sparse/0 or the \
+             directory itself; it holds {}",
             if names.is_empty() {
                 "nothing".into()
             } else {

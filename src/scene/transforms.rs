@@ -1,8 +1,9 @@
 //! transforms.json and its dialects: nerfstudio, instant-ngp, Neuralangelo, and Blender's split files.
 //!
-//! All of them hold camera-to-world matrices with OpenGL's camera axes, and intrinsics that may stand once or per frame, in pixels
-//! or as angles, with or without the picture's size. Neuralangelo adds sphere_center, sphere_radius and aabb_range; instant-ngp
-//! adds aabb_scale, scale and offset, which say that the region is the cube of aabb_scale about 0.5 of `scale · x + offset`.
+//! All of them hold camera-to-world matrices with OpenGL's camera axes (with OpenCV's where NeuS2 writes from_na), and intrinsics that
+//! may stand once or per frame, in pixels or as angles, with or without the picture's size. Neuralangelo adds sphere_center,
+//! sphere_radius and aabb_range; instant-ngp adds aabb_scale, scale and offset, which say that the region is the cube of aabb_scale
+//! about 0.5 of `scale · x + offset`.
 
 mod intrinsics;
 
@@ -13,7 +14,8 @@ use glam::{DMat4, DVec3};
 use serde_json::Value;
 
 use super::json::{Document, ENDINGS, brief, file_name, find};
-use super::{Format, Frame, FrameLens, PriorPaths, Reading, RegionHint, Skipped, Split, points};
+use super::{Format, Frame, FrameLens, PriorPaths, Reading, RegionHint, Skipped, Split};
+use super::{opengl_from_opencv, points};
 use crate::Result;
 
 pub(super) use intrinsics::Intrinsics;
@@ -22,12 +24,13 @@ pub(super) use intrinsics::Intrinsics;
 const NGP_SCALE: f64 = 0.33;
 const NGP_OFFSET: f64 = 0.5;
 
-/// Reads `file` and, beside a transforms.json or transforms_train.json, the held-out views of transforms_test.json or _val.json.
+/// NeuS2's training views.
+pub(super) const NEUS2: &str = "transform_train.json";
+
+/// Reads `file` and the held-out views of the file beside it that is for them.
 pub(super) fn read(file: &Path) -> Result<Reading> {
     let root = file.parent().unwrap_or(Path::new("")).to_path_buf();
-    let blender = file
-        .file_name()
-        .is_some_and(|name| name == "transforms_train.json");
+    let blender = file_name(file) == "transforms_train.json";
     let document = Document::open(file)?;
     let mut reading = Reading {
         format: document.format(blender),
@@ -41,13 +44,7 @@ pub(super) fn read(file: &Path) -> Result<Reading> {
         file: file.to_path_buf(),
         root,
     };
-    if blender
-        || file
-            .file_name()
-            .is_some_and(|name| name == "transforms.json")
-    {
-        read_held_out(&mut reading)?;
-    }
+    read_held_out(&mut reading)?;
     document.split_by_lists(&mut reading)?;
     if let Some(path) = document.text("ply_file_path")? {
         let path = reading.root.join(path.replace('\\', "/"));
@@ -70,10 +67,17 @@ pub(super) fn read(file: &Path) -> Result<Reading> {
     Ok(reading)
 }
 
-/// Adds the frames of transforms_test.json, or else of transforms_val.json, as held-out views.
+/// Adds the frames of the first file of held-out views that is there.
 fn read_held_out(reading: &mut Reading) -> Result<()> {
-    let mut files = ["transforms_test.json", "transforms_val.json"]
-        .into_iter()
+    let names: &[&str] = match file_name(&reading.file).as_str() {
+        "transforms.json" | "transforms_train.json" => {
+            &["transforms_test.json", "transforms_val.json"]
+        }
+        NEUS2 => &["transform_test.json"],
+        _ => &[],
+    };
+    let mut files = names
+        .iter()
         .map(|name| reading.root.join(name))
         .filter(|file| file.is_file());
     let Some(file) = files.next() else {
@@ -133,6 +137,7 @@ impl Document<'_> {
         let Some(entries) = self.top.get("frames").and_then(Value::as_array) else {
             return Err(self.error("has no list of frames"));
         };
+        let opencv = self.top.get("from_na").and_then(Value::as_bool) == Some(true);
         let mut frames = Vec::with_capacity(entries.len());
         for (index, entry) in entries.iter().enumerate() {
             let Some(entry) = entry.as_object() else {
@@ -147,6 +152,7 @@ impl Document<'_> {
             let matrix = entry
                 .get("transform_matrix")
                 .ok_or_else(|| self.error(format!("{place}has no transform_matrix")))?;
+            let pose = self.pose(matrix, "transform_matrix", &place)?;
             let mask = entry
                 .get("mask_path")
                 .and_then(Value::as_str)
@@ -155,7 +161,10 @@ impl Document<'_> {
                 image: find(root, path, &ENDINGS),
                 mask,
                 lens: FrameLens::Keys(self.intrinsics(entry, &place)?),
-                world_from_camera: self.pose(matrix, "transform_matrix", &place)?,
+                world_from_camera: match opencv {
+                    true => opengl_from_opencv(pose),
+                    false => pose,
+                },
                 split: None,
                 priors: PriorPaths::default(),
                 name,

@@ -67,10 +67,17 @@ fn one_rig_in_every_layout_gives_the_same_rays() {
     rig.write_colmap_binary(&colmap.at("sparse/0"));
     let ngp = json!({"aabb_scale": 4, "scale": 0.33, "offset": [0.5, 0.5, 0.5]});
     let neuralangelo = json!({"sphere_center": [1.0, 2.0, 0.5], "sphere_radius": 1.5});
+    let mut opencv = rig.clone();
+    for (index, (_, pose)) in opencv.views.iter_mut().enumerate() {
+        *pose = rig.opencv_pose(index);
+    }
+    let neus2 =
+        json!({"from_na": true, "aabb_scale": 1.0, "scale": 0.5, "offset": [0.5, 0.5, 0.5]});
     let layouts = [
         (Format::Colmap, colmap),
         (Format::Nerfstudio, rig.dataset(&rig.transforms(json!({})))),
         (Format::InstantNgp, rig.dataset(&rig.transforms(ngp))),
+        (Format::InstantNgp, rig.dataset(&opencv.transforms(neus2))),
         (
             Format::Neuralangelo,
             rig.dataset(&rig.transforms(neuralangelo)),
@@ -84,6 +91,21 @@ fn one_rig_in_every_layout_gives_the_same_rays() {
         assert_eq!(scene.format, format);
         assert_rays(&rig, &scene);
     }
+}
+
+#[test]
+fn neus2_holds_views_out_in_a_file_of_its_own() {
+    let (rig, dataset) = (Rig::skewed(5), Dataset::new());
+    rig.write_pictures(&dataset.at("images"));
+    for (split, views) in [("train", 0..3), ("test", 3..5)] {
+        let mut part = rig.clone();
+        part.views = rig.views[views].to_vec();
+        let transforms = part.transforms(json!({"from_na": false}));
+        dataset.write(&format!("transform_{split}.json"), transforms.to_string());
+    }
+    let scene = dataset.open().unwrap();
+    assert_rays(&rig, &scene);
+    assert_eq!(scene.split(Split::Test).collect::<Vec<_>>(), [3, 4]);
 }
 
 #[test]
