@@ -6,15 +6,15 @@
 //! about 0.5 of `scale · x + offset`.
 
 mod intrinsics;
+mod splits;
 
-use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 
 use glam::{DMat4, DVec3};
 use serde_json::Value;
 
 use super::json::{Document, ENDINGS, brief, file_name, find};
-use super::{Format, Frame, FrameLens, PriorPaths, Reading, RegionHint, Skipped, Split};
+use super::{Format, Frame, FrameLens, PriorPaths, Reading, RegionHint, Skipped};
 use super::{opengl_from_opencv, points};
 use crate::Result;
 
@@ -32,19 +32,21 @@ pub(super) fn read(file: &Path) -> Result<Reading> {
     let root = file.parent().unwrap_or(Path::new("")).to_path_buf();
     let blender = file_name(file) == "transforms_train.json";
     let document = Document::open(file)?;
+    let mut skipped = Vec::new();
     let mut reading = Reading {
         format: document.format(blender),
-        frames: document.frames(&root)?,
+        frames: document.frames("frames", &root, &mut skipped)?,
         points: Vec::new(),
         region_hint: None,
-        skipped: Vec::new(),
+        skipped,
         notes: Vec::new(),
         world_from_colmap: document.applied_transform()?,
         truth_from_world: None,
         file: file.to_path_buf(),
         root,
     };
-    read_held_out(&mut reading)?;
+    splits::read_held_out(&mut reading)?;
+    document.hold_out_test_frames(&mut reading)?;
     document.split_by_lists(&mut reading)?;
     if let Some(path) = document.text("ply_file_path")? {
         let path = reading.root.join(path.replace('\\', "/"));
@@ -67,52 +69,23 @@ pub(super) fn read(file: &Path) -> Result<Reading> {
     Ok(reading)
 }
 
-/// Adds the frames of the first file of held-out views that is there.
-fn read_held_out(reading: &mut Reading) -> Result<()> {
-    let names: &[&str] = match file_name(&reading.file).as_str() {
-        "transforms.json" | "transforms_train.json" => {
-            &["transforms_test.json", "transforms_val.json"]
+/// ScanNet++: where pictures and masks are, beside the folder `nerfstudio` of the files of poses.
+fn scannetpp_folders(file: &Path) -> Option<(PathBuf, PathBuf)> {
+    let (pictures, masks) = match file_name(file).as_str() {
+        "transforms.json" => ("resized_images", "resized_anon_masks"),
+        "transforms_undistorted.json" => {
+            ("resized_undistorted_images", "resized_undistorted_masks")
         }
-        NEUS2 => &["transform_test.json"],
-        _ => &[],
+        _ => return None,
     };
-    let mut files = names
-        .iter()
-        .map(|name| reading.root.join(name))
-        .filter(|file| file.is_file());
-    let Some(file) = files.next() else {
-        return Ok(());
-    };
-    if let Some(other) = files.next() {
-        reading.skipped.push(Skipped {
-            what: other.display().to_string(),
-            why: "the held-out views are those of transforms_test.json".into(),
-        });
-    }
-    let mut test = Document::open(&file)?.frames(&reading.root)?;
-    for frame in &mut test {
-        frame.split = Some(Split::Test);
-    }
-    let images: HashSet<&PathBuf> = test
-        .iter()
-        .filter_map(|frame| frame.image.as_ref().ok())
-        .collect();
-    let before = reading.frames.len();
-    reading.frames.retain(|frame| {
-        !frame
-            .image
-            .as_ref()
-            .is_ok_and(|image| images.contains(image))
-    });
-    if reading.frames.len() < before {
-        let shared = before - reading.frames.len();
-        reading.notes.push(format!(
-            "{shared} views are in {} too, and so not trained on",
-            file.display()
-        ));
-    }
-    reading.frames.extend(test);
-    Ok(())
+    let file = file.canonicalize().ok()?;
+    let folder = file.parent()?;
+    (file_name(folder) == "nerfstudio").then(|| {
+        (
+            folder.with_file_name(pictures),
+            folder.with_file_name(masks),
+        )
+    })
 }
 
 impl Document<'_> {
@@ -132,23 +105,42 @@ impl Document<'_> {
         }
     }
 
-    /// The frames, in the file's order.
-    fn frames(&self, root: &Path) -> Result<Vec<Frame>> {
-        let Some(entries) = self.top.get("frames").and_then(Value::as_array) else {
-            return Err(self.error("has no list of frames"));
+    /// The frames that are listed under `key`, in the file's order, without those that are said to be bad.
+    fn frames(&self, key: &str, root: &Path, skipped: &mut Vec<Skipped>) -> Result<Vec<Frame>> {
+        let Some(entries) = self.top.get(key).and_then(Value::as_array) else {
+            return Err(self.error(format!("has no list of {key}")));
+        };
+        let frame = key.trim_end_matches('s');
+        let (pictures, masks) = scannetpp_folders(self.file).unzip();
+        let find = |path: &str, beside: &Option<PathBuf>, endings: &[&str]| {
+            find(root, path, endings).or_else(|why| match beside {
+                Some(folder) => find(folder, path, endings).map_err(|_| why),
+                None => Err(why),
+            })
         };
         let opencv = self.top.get("from_na").and_then(Value::as_bool) == Some(true);
         let mut frames = Vec::with_capacity(entries.len());
         for (index, entry) in entries.iter().enumerate() {
             let Some(entry) = entry.as_object() else {
-                return Err(self.error(format!("frame {index} is {}, not an object", brief(entry))));
+                return Err(self.error(format!(
+                    "{frame} {index} is {}, not an object",
+                    brief(entry)
+                )));
             };
             let Some(path) = entry.get("file_path").and_then(Value::as_str) else {
-                return Err(self.error(format!("frame {index} has no file_path")));
+                return Err(self.error(format!("{frame} {index} has no file_path")));
             };
             let name = path.replace('\\', "/");
             let name = name.trim_start_matches("./").to_owned();
-            let place = format!("frame {index} ({name}): ");
+            // ScanNet++: blurred, or with a pose that did not come out well.
+            if entry.get("is_bad").and_then(Value::as_bool) == Some(true) {
+                skipped.push(Skipped {
+                    what: name,
+                    why: format!("is_bad says that it is, in {}", file_name(self.file)),
+                });
+                continue;
+            }
+            let place = format!("{frame} {index} ({name}): ");
             let matrix = entry
                 .get("transform_matrix")
                 .ok_or_else(|| self.error(format!("{place}has no transform_matrix")))?;
@@ -156,9 +148,9 @@ impl Document<'_> {
             let mask = entry
                 .get("mask_path")
                 .and_then(Value::as_str)
-                .map(|mask| find(root, mask, &[]));
+                .map(|mask| find(mask, &masks, &[]));
             frames.push(Frame {
-                image: find(root, path, &ENDINGS),
+                image: find(path, &pictures, &ENDINGS),
                 mask,
                 lens: FrameLens::Keys(self.intrinsics(entry, &place)?),
                 world_from_camera: match opencv {
@@ -187,50 +179,6 @@ impl Document<'_> {
             None => DMat4::IDENTITY,
         };
         Ok(DMat4::from_scale(DVec3::splat(scale)) * transform)
-    }
-
-    /// nerfstudio: lists of the frames that belong to each split.
-    fn split_by_lists(&self, reading: &mut Reading) -> Result<()> {
-        let list = |key: &str| -> Option<HashSet<String>> {
-            let names = self
-                .top
-                .get(key)?
-                .as_array()?
-                .iter()
-                .filter_map(Value::as_str);
-            Some(
-                names
-                    .map(|name| name.replace('\\', "/").trim_start_matches("./").to_owned())
-                    .collect(),
-            )
-        };
-        let (train, val, test) = (
-            list("train_filenames"),
-            list("val_filenames"),
-            list("test_filenames"),
-        );
-        let Some(held_out) = test.as_ref().or(val.as_ref()) else {
-            return Ok(());
-        };
-        let mut unlisted = 0;
-        reading.frames.retain_mut(|frame| {
-            if frame.split.is_none() && held_out.contains(&frame.name) {
-                frame.split = Some(Split::Test);
-            }
-            let keep = frame.split.is_some()
-                || train
-                    .as_ref()
-                    .is_none_or(|train| train.contains(&frame.name));
-            unlisted += usize::from(!keep);
-            keep
-        });
-        if unlisted > 0 {
-            reading.skipped.push(Skipped {
-                what: format!("{unlisted} frames"),
-                why: "neither in train_filenames nor among the held-out ones".into(),
-            });
-        }
-        Ok(())
     }
 
     fn region_hint(&self, no_points: bool) -> Result<Option<RegionHint>> {

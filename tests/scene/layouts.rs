@@ -463,6 +463,50 @@ fn held_out_views_come_from_the_dataset_or_every_eighth() {
 }
 
 #[test]
+fn scannetpp_holds_views_out_names_bad_ones_and_keeps_pictures_beside() {
+    let (rig, dataset) = (Rig::skewed(8), Dataset::new());
+    let mut frames = rig.frames(|name| format!("{name}.png"));
+    for frame in &mut frames {
+        frame["mask_path"] = frame["file_path"].clone();
+        frame["is_bad"] = json!(false);
+    }
+    frames[1]["is_bad"] = json!(true);
+    let mut transforms = rig.transforms(json!({}));
+    // As its undistorting script leaves it, one of the held-out views is in both lists.
+    transforms["frames"] = frames[..6].into();
+    transforms["test_frames"] = frames[5..].into();
+    for (file, images, masks) in [
+        ("transforms.json", "resized_images", "resized_anon_masks"),
+        (
+            "transforms_undistorted.json",
+            "resized_undistorted_images",
+            "resized_undistorted_masks",
+        ),
+    ] {
+        let file = format!("dslr/nerfstudio/{file}");
+        dataset.write(&file, transforms.to_string());
+        rig.write_pictures(&dataset.at("dslr").join(images));
+        rig.write_pictures(&dataset.at("dslr").join(masks));
+        let scene = Scene::open(&dataset.at(&file), &SceneOptions::default()).unwrap();
+        let mut read = rig.clone();
+        read.views.remove(1);
+        assert_rays(&read, &scene);
+        assert_eq!(scene.split(Split::Test).collect::<Vec<_>>(), [4, 5, 6]);
+        assert!(scene.views[4].name.contains(&rig.views[5].0));
+        let skipped = &scene.skipped[0];
+        assert!(
+            skipped.what.contains(&rig.views[1].0) && skipped.why.contains("is_bad"),
+            "{skipped:?}"
+        );
+        for view in &scene.views {
+            let mask = view.mask_path.as_ref().unwrap();
+            assert!(view.image_path.parent().unwrap().ends_with(images));
+            assert!(mask.parent().unwrap().ends_with(masks), "{mask:?}");
+        }
+    }
+}
+
+#[test]
 fn points_come_from_the_ply_file_named() {
     let rig = Rig::skewed(3);
     let dataset = rig.dataset(&rig.transforms(json!({"ply_file_path": ".\\sparse_pc.ply"})));
