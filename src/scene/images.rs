@@ -195,13 +195,26 @@ fn decode(path: &Path) -> Result<(RgbaImage, Orientation)> {
     Ok((image.into_rgba8(), orientation))
 }
 
-/// Whether a JPEG lacks its end, which decoders forgive and fill with grey: no end marker follows its last scan.
+/// Whether a JPEG lacks its end, which decoders forgive and fill with grey: no end marker follows its first scan. What follows the end
+/// may be anything, such as a phone's film.
 fn is_cut_off(path: &Path) -> Result<bool> {
     let data = std::fs::read(path).map_err(|source| Error::unreadable(path, &source))?;
-    let is = |marker: u8| move |pair: &[u8]| pair == [0xff, marker];
-    let last_scan = data.windows(2).rposition(is(0xda));
     Ok(data.starts_with(&[0xff, 0xd8, 0xff])
-        && last_scan.is_some_and(|scan| !data[scan..].windows(2).any(is(0xd9))))
+        && first_scan(&data).is_some_and(|scan| !scan.windows(2).any(|pair| pair == [0xff, 0xd9])))
+}
+
+/// What follows a JPEG's first marker of a scan. Segments before it are passed by their lengths: a preview in one is a JPEG of its own.
+fn first_scan(jpeg: &[u8]) -> Option<&[u8]> {
+    let mut at = 2;
+    while let [0xff, marker, segment @ ..] = jpeg.get(at..)? {
+        at += match marker {
+            0xda => return Some(segment),
+            0xff => 1,               // fills up
+            0x01 | 0xd0..=0xd8 => 2, // stands alone
+            _ => 2 + usize::from(u16::from_be_bytes(*segment.first_chunk()?)),
+        };
+    }
+    None
 }
 
 fn decode_exr(path: &Path) -> Result<RgbaImage> {

@@ -249,9 +249,8 @@ fn intrinsics_follow_pictures_of_another_size() {
         .refuses(&["view_000.png", "64x48", "128x128"]);
 }
 
-/// Decoders fill what is missing with grey.
-#[test]
-fn jpegs_that_are_cut_off_are_refused() {
+/// A rig whose pictures are JPEGs of noise with EXIF data, and the first of them.
+fn noisy_jpegs(exif: &[u8]) -> (Dataset, std::path::PathBuf) {
     let rig = Rig::skewed(2);
     let dataset = with_ending(&rig, "jpg");
     for (name, _) in &rig.views {
@@ -259,12 +258,20 @@ fn jpegs_that_are_cut_off_are_refused() {
             image::Rgb([(x * 97) ^ (y * 61), x * 31 + y * 7, x * y].map(|value| value as u8))
         });
         let file = fs::File::create(dataset.at(&format!("images/{name}.jpg"))).unwrap();
-        JpegEncoder::new_with_quality(file, 90)
-            .encode_image(&noise)
-            .unwrap();
+        let mut encoder = JpegEncoder::new_with_quality(file, 90);
+        encoder.set_exif_metadata(exif.to_vec()).unwrap();
+        encoder.encode_image(&noise).unwrap();
     }
+    let first = dataset.at(&format!("images/{}.jpg", rig.views[0].0));
+    (dataset, first)
+}
+
+/// Decoders fill what is missing with grey.
+#[test]
+fn jpegs_that_are_cut_off_are_refused() {
+    // The preview in the EXIF data is whole either way.
+    let (dataset, file) = noisy_jpegs(b"\xff\xd8\xff\xda\0\x02\xff\xd9");
     load(&dataset, 0);
-    let file = dataset.at(&format!("images/{}.jpg", rig.views[0].0));
     let whole = fs::read(&file).unwrap();
     for kept in [whole.len() * 2 / 3, whole.len() - 2] {
         fs::write(&file, &whole[..kept]).unwrap();
@@ -275,6 +282,17 @@ fn jpegs_that_are_cut_off_are_refused() {
             "{told}"
         );
     }
+}
+
+/// Motion photos: a film follows the end of the picture.
+#[test]
+fn jpegs_that_something_follows_are_whole() {
+    let (dataset, file) = noisy_jpegs(b"");
+    let alone = load(&dataset, 0);
+    let whole = fs::read(&file).unwrap();
+    let film = [b"\0\0\0\x18ftypmp42", &[0xff, 0xda, 7, 0xff][..]].concat();
+    fs::write(&file, [whole, film].concat()).unwrap();
+    assert_eq!(load(&dataset, 0), alone);
 }
 
 #[test]
