@@ -120,7 +120,7 @@ pub(super) fn read(path: &Path, model: &Path) -> Result<Reading> {
         region_hint: None,
         skipped,
         notes,
-        world_from_colmap: DMat4::IDENTITY,
+        world_from_colmap: vec![DMat4::IDENTITY],
         truth_from_world: None,
     })
 }
@@ -197,13 +197,12 @@ pub(super) fn adopt_points(reading: &mut Reading, model: &Path) {
             "{used} is used, with its own points; give this path to use the COLMAP model"
         ));
     }
-    let world = reading.world_from_colmap;
     let base = |name: &str| name.rsplit('/').next().unwrap_or(name).to_owned();
     let positions: HashMap<String, DVec3> = other
         .iter()
         .map(|image| {
             let position = image.world_from_camera.w_axis.truncate();
-            (base(&image.name), world.transform_point3(position))
+            (base(&image.name), position)
         })
         .collect();
     let pairs: Vec<(DVec3, DVec3)> = reading
@@ -222,10 +221,19 @@ pub(super) fn adopt_points(reading: &mut Reading, model: &Path) {
         .map(|(here, _)| (*here - mean).length())
         .sum::<f64>()
         / pairs.len().max(1) as f64;
-    let agree = pairs
+    let agreeing = |world: &DMat4| {
+        let off = |here: DVec3, there: DVec3| (here - world.transform_point3(there)).length();
+        let near = pairs
+            .iter()
+            .filter(|(here, there)| off(*here, *there) <= 1e-3 * spread);
+        (near.count(), *world)
+    };
+    let (agree, world) = reading
+        .world_from_colmap
         .iter()
-        .filter(|(here, there)| (*here - *there).length() <= 1e-3 * spread)
-        .count();
+        .map(agreeing)
+        .max_by_key(|(agree, _)| *agree)
+        .expect("at least one");
     if pairs.len() < 3 || agree * 10 < pairs.len() * 9 {
         return skip(format!(
             "{used} is used; this COLMAP model has {agree} of {} cameras in the same places, so its points are of another frame",

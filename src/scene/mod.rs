@@ -229,8 +229,8 @@ struct Reading {
     region_hint: Option<RegionHint>,
     skipped: Vec<Skipped>,
     notes: Vec<String>,
-    /// What was done to COLMAP's world to make this one.
-    world_from_colmap: DMat4,
+    /// What was done to COLMAP's world to make this one, or what may have been.
+    world_from_colmap: Vec<DMat4>,
     truth_from_world: Option<DMat4>,
 }
 

@@ -72,7 +72,7 @@ pub(super) fn read(path: &Path, cameras: &Path) -> Result<Reading> {
         region_hint: None,
         skipped: without_camera.collect(),
         notes: Vec::new(),
-        world_from_colmap: DMat4::IDENTITY,
+        world_from_colmap: vec![DMat4::IDENTITY],
         truth_from_world: None,
     })
 }

@@ -82,7 +82,7 @@ pub(super) fn read(file: &Path) -> Result<Reading> {
         region_hint,
         skipped: Vec::new(),
         notes,
-        world_from_colmap: DMat4::IDENTITY,
+        world_from_colmap: vec![DMat4::IDENTITY],
         truth_from_world: None,
     })
 }

@@ -54,7 +54,7 @@ pub(super) fn read(file: &Path) -> Result<Reading> {
         skipped: Vec::new(),
         notes,
         // Scans are aligned in COLMAP's world, so that a model beside the file is in the frame that worldtogt leads to.
-        world_from_colmap: truth_from_world.map_or(DMat4::IDENTITY, |truth| truth.inverse()),
+        world_from_colmap: vec![truth_from_world.map_or(DMat4::IDENTITY, |truth| truth.inverse())],
         truth_from_world,
     })
 }

@@ -10,7 +10,7 @@ mod splits;
 
 use std::path::{Path, PathBuf};
 
-use glam::{DMat4, DVec3};
+use glam::{DMat4, DVec3, DVec4};
 use serde_json::Value;
 
 use super::json::{Document, ENDINGS, brief, file_name, find};
@@ -23,6 +23,9 @@ pub(super) use intrinsics::Intrinsics;
 /// instant-ngp's defaults for `scale` and `offset`.
 const NGP_SCALE: f64 = 0.33;
 const NGP_OFFSET: f64 = 0.5;
+
+/// What nerfstudio did to COLMAP's world before it came to write applied_transform: x, y, z to y, x, -z.
+const UNSTATED_TRANSFORM: DMat4 = DMat4::from_cols(DVec4::Y, DVec4::X, DVec4::NEG_Z, DVec4::W);
 
 /// NeuS2's training views.
 pub(super) const NEUS2: &str = "transform_train.json";
@@ -40,7 +43,7 @@ pub(super) fn read(file: &Path) -> Result<Reading> {
         region_hint: None,
         skipped,
         notes: Vec::new(),
-        world_from_colmap: document.applied_transform()?,
+        world_from_colmap: document.applied_transforms()?,
         truth_from_world: None,
         file: file.to_path_buf(),
         root,
@@ -165,20 +168,22 @@ impl Document<'_> {
         Ok(frames)
     }
 
-    /// nerfstudio: what was done to COLMAP's world on the way into this file.
-    fn applied_transform(&self) -> Result<DMat4> {
+    /// nerfstudio: what was done to COLMAP's world on the way into this file; what may have been, where it does not say.
+    fn applied_transforms(&self) -> Result<Vec<DMat4>> {
         let scale = self.number(&self.top, "applied_scale", "")?.unwrap_or(1.0);
-        let transform = match self
+        let transforms = match self
             .top
             .get("applied_transform")
             .filter(|value| !value.is_null())
         {
-            Some(value) => self
-                .matrix(value)
-                .map_err(|what| self.error(format!("applied_transform {what}")))?,
-            None => DMat4::IDENTITY,
+            Some(value) => vec![
+                self.matrix(value)
+                    .map_err(|what| self.error(format!("applied_transform {what}")))?,
+            ],
+            None => vec![DMat4::IDENTITY, UNSTATED_TRANSFORM],
         };
-        Ok(DMat4::from_scale(DVec3::splat(scale)) * transform)
+        let scale = DMat4::from_scale(DVec3::splat(scale));
+        Ok(transforms.into_iter().map(|t| scale * t).collect())
     }
 
     fn region_hint(&self, no_points: bool) -> Result<Option<RegionHint>> {

@@ -572,6 +572,20 @@ fn points_of_a_model_beside_transforms_are_used_if_its_cameras_agree() {
     assert_eq!(scene.points.len(), rig.points.len());
     let wanted = applied.transform_point3(rig.points[7]);
     assert!((scene.points[7].position - wanted).length() < 1e-9);
+
+    // Before nerfstudio said what it did, it did this.
+    let swapped = |p: DVec3| DVec3::new(p.y, p.x, -p.z);
+    let mut older = rig.clone();
+    for (_, pose) in &mut older.views {
+        let [x, y, z, w] = [pose.x_axis, pose.y_axis, pose.z_axis, pose.w_axis]
+            .map(|axis| swapped(axis.truncate()).extend(axis.w));
+        *pose = DMat4::from_cols(x, y, z, w);
+    }
+    let dataset = older.dataset(&older.transforms(json!({})));
+    rig.write_colmap_binary(&dataset.at("sparse/0"));
+    let scene = dataset.open().unwrap();
+    assert_eq!(scene.points.len(), rig.points.len());
+    assert!((scene.points[7].position - swapped(rig.points[7])).length() < 1e-9);
 }
 
 #[test]
