@@ -79,9 +79,11 @@ pub(super) fn read(path: &Path, model: &Path) -> Result<Reading> {
             Vec::new()
         }
     };
-    note_other_models(model, &mut skipped);
+    // Of a model that is given as `.`, the path does not hold the directories around it.
+    let resolved = model.canonicalize().unwrap_or_else(|_| model.into());
+    note_other_models(&resolved, &mut skipped);
 
-    let folder = image_folder(path, model, &images);
+    let folder = image_folder(path, [model, &resolved], &images);
     let mut frames = Vec::with_capacity(images.len());
     for image in images {
         let camera = cameras.get(&image.camera_id).ok_or_else(|| {
@@ -134,9 +136,12 @@ fn folder_root(path: &Path, images: &Path) -> PathBuf {
     }
 }
 
-/// The folder that holds most of the pictures: below the dataset, or below one of the directories around the model.
-fn image_folder(path: &Path, model: &Path, images: &[ImageRecord]) -> PathBuf {
-    let roots = std::iter::once(path).chain(model.ancestors().skip(1).take(3));
+/// The folder that holds most of the pictures: below the dataset, or below one of the directories around the model, by either of its paths.
+fn image_folder(path: &Path, models: [&Path; 2], images: &[ImageRecord]) -> PathBuf {
+    let around = models
+        .into_iter()
+        .flat_map(|model| model.ancestors().skip(1).take(3));
+    let roots = std::iter::once(path).chain(around);
     let candidates = roots.flat_map(|root| {
         IMAGE_FOLDERS
             .into_iter()

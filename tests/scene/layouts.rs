@@ -265,6 +265,7 @@ fn a_colmap_model_is_found_wherever_it_lies() {
         ("sparse/0", "input", ""),
         ("sparse/0", "images", "sparse/0"),
         ("sparse/0", "images", "sparse"),
+        ("sparse/0", "images", "sparse/0/../0/../0"),
         ("colmap/sparse/0", "images", "colmap/sparse/0"),
     ] {
         let dataset = Dataset::new();
