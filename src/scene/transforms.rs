@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 use glam::{DMat4, DVec3, DVec4};
 use serde_json::Value;
 
-use super::json::{Document, ENDINGS, brief, file_name, find};
+use super::json::{Document, ENDINGS, Object, brief, file_name, find};
 use super::{Format, Frame, FrameLens, PriorPaths, Reading, RegionHint, Skipped};
 use super::{opengl_from_opencv, points};
 use crate::Result;
@@ -63,6 +63,7 @@ pub(super) fn read(file: &Path) -> Result<Reading> {
         }
     }
     reading.region_hint = document.region_hint(reading.points.is_empty())?;
+    document.note_unused(&mut reading.skipped);
     let skew = document.number(&document.top, "sk_x", "")?.unwrap_or(0.0);
     if skew.abs() > 1e-3 {
         reading.notes.push(format!(
@@ -184,6 +185,31 @@ impl Document<'_> {
         };
         let scale = DMat4::from_scale(DVec3::splat(scale));
         Ok(transforms.into_iter().map(|t| scale * t).collect())
+    }
+
+    /// Says which keys would make a difference, but are not used.
+    fn note_unused(&self, skipped: &mut Vec<Skipped>) {
+        for (key, why) in [
+            (
+                "fisheye_crop_radius",
+                "not used: pixels outside of that circle are trained on unless masks hide them",
+            ),
+            (
+                "depth_file_path",
+                "not used: depths are read from sdfstudio's meta_data.json (sensor_depth_path)",
+            ),
+        ] {
+            let has = |object: &Object| object.get(key).is_some_and(|value| !value.is_null());
+            let frames = self.top.get("frames").and_then(Value::as_array);
+            let frames = frames.into_iter().flatten().filter_map(Value::as_object);
+            let what = match frames.filter(|frame| has(frame)).count() {
+                0 if has(&self.top) => key.to_owned(),
+                0 => continue,
+                named => format!("{key} of {named} frames"),
+            };
+            let why = why.to_owned();
+            skipped.push(Skipped { what, why });
+        }
     }
 
     fn region_hint(&self, no_points: bool) -> Result<Option<RegionHint>> {

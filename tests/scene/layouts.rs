@@ -402,6 +402,39 @@ fn lens_keys_choose_the_model() {
 }
 
 #[test]
+fn distortion_may_be_a_list_where_no_key_says_it() {
+    let rig = Rig::skewed(2);
+    let list = json!([0.1, 0.2, 0.0, 0.0, 0.3, 0.4]);
+    let distortion = |transforms: &serde_json::Value| {
+        let scene = rig.dataset(transforms).open().unwrap();
+        scene.views[1].camera.params[4..].to_vec()
+    };
+    let whole = rig.transforms(json!({"distortion_params": list}));
+    assert_eq!(distortion(&whole), [0.1, 0.2, 0.3, 0.4]);
+    let mut own = rig.transforms(json!({"distortion_params": [0.5, 0, 0, 0, 0, 0]}));
+    own["frames"][1]["distortion_params"] = list.clone();
+    assert_eq!(distortion(&own), [0.1, 0.2, 0.3, 0.4]);
+    own["k1"] = json!(0.7);
+    assert_eq!(distortion(&own), [0.1, 0.2, 0.3, 0.4], "a frame's own");
+    let keys = rig.transforms(json!({"distortion_params": list, "k1": 0.7}));
+    assert_eq!(distortion(&keys), [0.7, 0.0, 0.0, 0.0]);
+    rig.dataset(&rig.transforms(json!({"distortion_params": [0.1, 0.2]})))
+        .refuses(&["distortion_params is [0.1,0.2]", "k1, k2, k3, k4, p1, p2"]);
+}
+
+#[test]
+fn keys_that_are_not_used_are_said() {
+    let rig = Rig::skewed(3);
+    let mut transforms = rig.transforms(json!({"fisheye_crop_radius": 30.0}));
+    for frame in &mut transforms["frames"].as_array_mut().unwrap()[..2] {
+        frame["depth_file_path"] = json!("depth.png");
+    }
+    let skipped = rig.dataset(&transforms).open().unwrap().skipped;
+    let what: Vec<_> = skipped.iter().map(|skipped| &skipped.what).collect();
+    assert_eq!(what, ["fisheye_crop_radius", "depth_file_path of 2 frames"]);
+}
+
+#[test]
 fn held_out_views_come_from_the_dataset_or_every_eighth() {
     let rig = Rig::skewed(20);
     let splits = |scene: &Scene| {

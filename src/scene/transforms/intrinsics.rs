@@ -2,7 +2,7 @@
 
 use serde_json::Value;
 
-use super::super::json::{Document, Object};
+use super::super::json::{Document, Object, brief};
 use super::super::{Camera, CameraModel};
 use crate::{Error, Result};
 
@@ -10,15 +10,18 @@ impl Document<'_> {
     /// The intrinsics of one frame: its own keys before the file's.
     pub(super) fn intrinsics(&self, frame: &Object, place: &str) -> Result<Intrinsics> {
         // Keys that belong together come from the same level.
-        let group = |keys: &[&str]| -> Result<Vec<Option<f64>>> {
+        let level = |keys: &[&str]| {
             let own = keys
                 .iter()
                 .any(|key| frame.get(*key).is_some_and(|value| !value.is_null()));
-            let object = if own { frame } else { &self.top };
+            if own { frame } else { &self.top }
+        };
+        let numbers = |object: &Object, keys: &[&str]| -> Result<Vec<Option<f64>>> {
             keys.iter()
                 .map(|key| self.number(object, key, place))
                 .collect()
         };
+        let group = |keys: &[&str]| numbers(level(keys), keys);
         let either = |key: &str| frame.get(key).or_else(|| self.top.get(key));
         let is_true = |key: &str| either(key).is_some_and(|value| value.as_bool() == Some(true));
         for (key, lens) in [
@@ -71,19 +74,36 @@ impl Document<'_> {
             [None, None] => None,
             _ => return Err(self.error(format!("{place}w and h are no picture size"))),
         };
-        let distortion = group(&["k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2"])?;
-        let mut coefficients = [0.0; 8];
-        for (slot, value) in coefficients.iter_mut().zip(distortion) {
-            *slot = value.unwrap_or(0.0);
-        }
+        let keys = ["k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2"];
+        let list = "distortion_params";
+        let object = level(&[&keys[..], &[list]].concat());
+        let distortion = numbers(object, &keys)?;
+        let distortion = match object.get(list).filter(|list| !list.is_null()) {
+            Some(list) if distortion == [None; 8] => self.distortion_params(list, place)?,
+            _ => std::array::from_fn(|i| distortion[i].unwrap_or(0.0)),
+        };
         Ok(Intrinsics {
             focal: [focal[0], focal[1]],
             center: [center[0], center[1]],
             angle: [angle[0], angle[1]],
             size,
-            distortion: coefficients,
+            distortion,
             fisheye,
         })
+    }
+
+    /// nerfstudio's list of k1 to k4, p1, p2, as k1 to k6, p1, p2.
+    fn distortion_params(&self, list: &Value, place: &str) -> Result<[f64; 8]> {
+        let numbers: Option<Vec<f64>> = list
+            .as_array()
+            .and_then(|list| list.iter().map(Value::as_f64).collect());
+        match numbers.as_deref() {
+            Some(&[k1, k2, k3, k4, p1, p2]) => Ok([k1, k2, k3, k4, 0.0, 0.0, p1, p2]),
+            _ => Err(self.error(format!(
+                "{place}distortion_params is {}, not the six numbers k1, k2, k3, k4, p1, p2",
+                brief(list)
+            ))),
+        }
     }
 
     fn unsupported_lens(&self, place: &str, lens: &str) -> Error {
