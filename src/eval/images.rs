@@ -5,9 +5,20 @@
 
 use crate::scene::Picture;
 
-/// PSNR and SSIM of a rendering `[height, width]` beside its photograph; with `masked`, of what the photograph's mask keeps.
+/// Whether a photograph's mask keeps a pixel.
+fn keeps(pixel: &[u8]) -> bool {
+    pixel[3] >= 128
+}
+
+/// Whether a photograph's mask keeps any pixel.
+pub fn keeps_any(photo: &Picture) -> bool {
+    photo.rgba.chunks_exact(4).any(keeps)
+}
+
+/// PSNR and SSIM of a rendering `[height, width]` beside its photograph; with `masked`, of what the photograph's mask keeps, which has to
+/// be something ([`keeps_any`]): the PSNR of nothing is no number.
 pub fn compare(rendered: &[[f32; 3]], photo: &Picture, masked: bool) -> (f64, Option<f64>) {
-    let counts = |pixel: &[u8]| !masked || pixel[3] >= 128;
+    let counts = |pixel: &[u8]| !masked || keeps(pixel);
     let colors = photo.rgb();
     // What does not count is made equal, and left out of the mean.
     let ours: Vec<f32> = rendered
@@ -20,16 +31,12 @@ pub fn compare(rendered: &[[f32; 3]], photo: &Picture, masked: bool) -> (f64, Op
             })
         })
         .collect();
-    let counted = photo
-        .rgba
-        .chunks_exact(4)
-        .filter(|pixel| counts(pixel))
-        .count();
-    let share = counted as f64 / rendered.len() as f64;
+    let counted: Vec<bool> = photo.rgba.chunks_exact(4).map(counts).collect();
+    let share = counted.iter().filter(|&&counts| counts).count() as f64 / rendered.len() as f64;
     let (width, height) = (photo.width as usize, photo.height as usize);
     (
         psnr(&ours, &colors) + 10.0 * share.log10(),
-        ssim(&ours, &colors, width, height, 3),
+        ssim_where(&ours, &colors, width, height, 3, |pixel| counted[pixel]),
     )
 }
 
@@ -63,12 +70,32 @@ const SIGMA: f64 = 1.5;
 /// # Panics
 /// If the slices are not `width · height · channels` long.
 pub fn ssim(a: &[f32], b: &[f32], width: usize, height: usize, channels: usize) -> Option<f64> {
+    ssim_where(a, b, width, height, channels, |_| true)
+}
+
+/// The same over the windows whose centre is a pixel that `counts`; `None` if there is none.
+fn ssim_where(
+    a: &[f32],
+    b: &[f32],
+    width: usize,
+    height: usize,
+    channels: usize,
+    counts: impl Fn(usize) -> bool,
+) -> Option<f64> {
     assert_eq!(
         (a.len(), b.len()),
         (width * height * channels, width * height * channels),
         "pictures of the stated size"
     );
     if width.min(height) <= 2 * RADIUS || channels == 0 {
+        return None;
+    }
+    let across = width - 2 * RADIUS;
+    let center = |i: usize| (i / across + RADIUS) * width + i % across + RADIUS;
+    let windows: Vec<usize> = (0..across * (height - 2 * RADIUS))
+        .filter(|&i| counts(center(i)))
+        .collect();
+    if windows.is_empty() {
         return None;
     }
     let (c1, c2) = (0.01f64.powi(2), 0.03f64.powi(2));
@@ -92,8 +119,9 @@ pub fn ssim(a: &[f32], b: &[f32], width: usize, height: usize, channels: usize) 
         let square_a = blurred(&|a, _| a * a);
         let square_b = blurred(&|_, b| b * b);
         let product = blurred(&|a, b| a * b);
-        let total: f64 = (0..mean_a.len())
-            .map(|i| {
+        let total: f64 = windows
+            .iter()
+            .map(|&i| {
                 let (ma, mb) = (mean_a[i], mean_b[i]);
                 let (variance_a, variance_b, covariance) = (
                     square_a[i] - ma * ma,
@@ -104,7 +132,7 @@ pub fn ssim(a: &[f32], b: &[f32], width: usize, height: usize, channels: usize) 
                     / ((ma * ma + mb * mb + c1) * (variance_a + variance_b + c2))
             })
             .sum();
-        total / mean_a.len() as f64
+        total / windows.len() as f64
     };
     Some((0..channels).map(channel_mean).sum::<f64>() / channels as f64)
 }
@@ -157,5 +185,39 @@ mod tests {
             "{whole}"
         );
         assert_eq!(ssim, None, "too small for a window");
+    }
+
+    /// Of a mask that keeps one pixel, the SSIM is that of the window around it.
+    #[test]
+    fn only_windows_around_what_the_mask_keeps_count() {
+        let (width, height, kept) = (20usize, 16usize, 8 * 20 + 11);
+        let colors = |pixel: usize| [1, 2, 3].map(|c| (pixel * 37 * c % 256) as u8);
+        let photo = |kept| Picture {
+            width: width as u32,
+            height: height as u32,
+            rgba: (0..width * height)
+                .flat_map(|pixel| {
+                    let [r, g, b] = colors(pixel);
+                    [r, g, b, if pixel == kept { 255 } else { 0 }]
+                })
+                .collect(),
+        };
+        let rendered = vec![[0.5; 3]; width * height];
+        let crop = |of: &dyn Fn(usize) -> [f32; 3]| -> Vec<f32> {
+            let rows = 8 - RADIUS..=8 + RADIUS;
+            rows.flat_map(|y| (11 - RADIUS..=11 + RADIUS).map(move |x| y * width + x))
+                .flat_map(of)
+                .collect()
+        };
+        let theirs = |pixel: usize| colors(pixel).map(|c| f32::from(c) / 255.0);
+        let ours = |pixel: usize| match pixel == kept {
+            true => [0.5; 3],
+            false => theirs(pixel),
+        };
+        let expected = ssim(&crop(&ours), &crop(&theirs), 11, 11, 3).unwrap();
+        let (_, got) = compare(&rendered, &photo(kept), true);
+        assert!((got.unwrap() - expected).abs() < 1e-9, "{got:?}");
+        let (_, at_the_edge) = compare(&rendered, &photo(0), true);
+        assert_eq!(at_the_edge, None, "no window is around it");
     }
 }

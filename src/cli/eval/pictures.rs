@@ -5,7 +5,7 @@ use crate::cli::progress::Progress;
 use crate::cli::render::Which;
 use crate::cli::{Context, interrupt};
 use crate::config::AppearanceAtEval;
-use crate::eval::images::compare;
+use crate::eval::images::{compare, keeps_any};
 use crate::render::Rendered;
 use crate::scene::{Picture, Split};
 use crate::train::run_directory::RunDirectory;
@@ -21,6 +21,8 @@ pub(in crate::cli) struct PictureScores {
     step: u64,
     appearance: AppearanceAtEval,
     pub views: Vec<ViewScore>,
+    /// Names of the views of which the mask keeps nothing: they have no scores.
+    masked_out: Vec<String>,
 }
 
 /// How alike a view's rendering and photograph are.
@@ -28,17 +30,29 @@ pub(in crate::cli) struct ViewScore {
     pub name: String,
     /// In dB.
     pub psnr: f64,
-    /// `None` for pictures that are too small for it.
+    /// `None` for pictures that are too small for it, or of which the mask keeps too little.
     pub ssim: Option<f64>,
 }
 
 impl PictureScores {
+    /// Compares a view's rendering with its photograph; with `masked`, what the photograph's mask keeps of it. False if that is nothing.
+    fn add(&mut self, name: &str, rendered: &[[f32; 3]], photo: &Picture, masked: bool) -> bool {
+        let name = name.to_owned();
+        if masked && !keeps_any(photo) {
+            self.masked_out.push(name);
+            return false;
+        }
+        let (psnr, ssim) = compare(rendered, photo, masked);
+        self.views.push(ViewScore { name, psnr, ssim });
+        true
+    }
+
     /// Mean over the views, in dB.
     pub fn psnr(&self) -> Option<f64> {
         mean(self.views.iter().map(|view| view.psnr).collect())
     }
 
-    /// Mean over the views that are large enough.
+    /// Mean over the views that have it.
     pub fn ssim(&self) -> Option<f64> {
         mean(self.views.iter().filter_map(|view| view.ssim).collect())
     }
@@ -55,6 +69,7 @@ impl PictureScores {
                 .iter()
                 .map(|view| json!({ "name": view.name, "psnr": view.psnr, "ssim": view.ssim }))
                 .collect::<Vec<_>>(),
+            "masked_out": self.masked_out,
         })
     }
 
@@ -62,19 +77,25 @@ impl PictureScores {
         let in_words = |ssim: Option<f64>| {
             ssim.map_or("too small for SSIM".into(), |ssim| format!("{ssim:.4}"))
         };
-        let widths = self.views.iter().map(|view| view.name.len());
+        let names = self.views.iter().map(|view| &view.name);
+        let widths = names.chain(&self.masked_out).map(String::len);
         let width = widths.max().unwrap_or(0);
         let mut text = String::new();
         for ViewScore { name, psnr, ssim } in &self.views {
             let _ = writeln!(text, "{name:<width$}  {psnr:6.2} dB  {}", in_words(*ssim));
         }
-        let _ = write!(
-            text,
-            "{:<width$}  {:6.2} dB  {}",
-            "mean",
-            self.psnr().unwrap_or(f64::NAN),
-            in_words(self.ssim())
-        );
+        for name in &self.masked_out {
+            let _ = writeln!(text, "{name:<width$}  masked out");
+        }
+        let _ = match self.psnr() {
+            Some(psnr) => write!(
+                text,
+                "{:<width$}  {psnr:6.2} dB  {}",
+                "mean",
+                in_words(self.ssim())
+            ),
+            None => write!(text, "no mean: the masks keep nothing of any view"),
+        };
         text
     }
 }
@@ -137,7 +158,13 @@ pub(in crate::cli) fn score(
     let interrupted = interrupt::flag(context, "stopping")?;
     let masked = trained.config().scene.masks.reads();
     let mut progress = Progress::new(context, "eval", 100 * wanted.len() as u64);
-    let mut views = Vec::new();
+    let mut scores = PictureScores {
+        run: run.root().into(),
+        step: trained.step,
+        appearance,
+        views: Vec::new(),
+        masked_out: Vec::new(),
+    };
     for (nth, &view) in wanted.iter().enumerate() {
         let name = &scene.views[view].name;
         let rendered = viewer.render(&scene, view, &mut |share| {
@@ -145,18 +172,42 @@ pub(in crate::cli) fn score(
             !interrupted.load(Ordering::SeqCst)
         })?;
         let picture = scene.load_picture(view)?;
-        let (psnr, ssim) = compare(&rendered.rgb, &picture, masked);
-        views.push(ViewScore {
-            name: name.clone(),
-            psnr,
-            ssim,
-        });
+        if !scores.add(name, &rendered.rgb, &picture, masked) {
+            context.warn(&format!(
+                "{name}: its mask keeps no pixel to compare, so that it has no scores and no part in the mean"
+            ));
+        }
         show(rendered, picture);
     }
-    Ok(PictureScores {
-        run: run.root().into(),
-        step: trained.step,
-        appearance,
-        views,
-    })
+    Ok(scores)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_view_that_is_masked_out_has_no_part_in_the_mean() {
+        let mut scores = PictureScores {
+            run: "run".into(),
+            step: 1,
+            appearance: AppearanceAtEval::Zero,
+            views: Vec::new(),
+            masked_out: Vec::new(),
+        };
+        let photo = |alpha| Picture {
+            width: 1,
+            height: 1,
+            rgba: vec![102, 102, 102, alpha],
+        };
+        let rendered = [[0.5; 3]];
+        assert!(!scores.add("hidden", &rendered, &photo(0), true));
+        assert_eq!(scores.psnr(), None);
+        assert!(scores.text().ends_with("nothing of any view"));
+        assert!(scores.add("shown", &rendered, &photo(255), true));
+        assert!(scores.add("ignored", &rendered, &photo(0), false));
+        assert!((scores.psnr().unwrap() - 20.0).abs() < 1e-3);
+        assert_eq!(scores.to_json()["masked_out"], json!(["hidden"]));
+        assert!(scores.text().contains("hidden   masked out\n"));
+    }
 }
