@@ -2,10 +2,10 @@
 
 use std::ffi::OsString;
 use std::fs::File;
-use std::io;
+use std::io::{self, ErrorKind::AlreadyExists, ErrorKind::NotFound};
 use std::path::{Path, PathBuf};
 
-use tempfile::TempPath;
+use tempfile::{PathPersistError, TempPath};
 
 /// Puts what `write` writes at `path`, in the place of a file that is there. On an error that file is as it was, and nothing half-written
 /// stays.
@@ -24,8 +24,24 @@ pub(crate) fn create<E: From<io::Error>>(
     write: impl FnOnce(&mut File) -> Result<(), E>,
 ) -> Result<(), E> {
     put(path, write, |part| {
-        part.persist_noclobber(path).map_err(|error| error.error)
+        rename_new(part, path, |part| part.persist_noclobber(path))
     })
+}
+
+/// Renames `part` by `noclobber`, which keeps a file that is there. Shared folders and some other file systems know no such way and
+/// refuse it: there, looking first is the best that can be done for a file that is already written.
+fn rename_new(
+    part: TempPath,
+    path: &Path,
+    noclobber: impl FnOnce(TempPath) -> Result<(), PathPersistError>,
+) -> io::Result<()> {
+    let is_free = || path.symlink_metadata().is_err_and(|e| e.kind() == NotFound);
+    match noclobber(part) {
+        Err(refused) if refused.error.kind() != AlreadyExists && is_free() => {
+            refused.path.persist(path).map_err(|error| error.error)
+        }
+        renamed => renamed.map_err(|error| error.error),
+    }
 }
 
 /// Where this process writes what is to be at `path`. What a process that was killed left behind has the same ending.
@@ -93,6 +109,33 @@ mod tests {
         assert_eq!(exists.kind(), io::ErrorKind::AlreadyExists);
         assert_eq!(read(), "second");
         assert_eq!(names(folder.path()), ["file.txt"]);
+    }
+
+    /// The errors of file systems that can neither rename without replacing nor link.
+    #[test]
+    fn a_new_file_is_renamed_where_nothing_but_replacing_works() {
+        let folder = tempfile::tempdir().unwrap();
+        let (path, other) = (folder.path().join("file"), folder.path().join("other"));
+        let refuse = |kind: io::ErrorKind| {
+            move |path| {
+                let error = kind.into();
+                Err(PathPersistError { error, path })
+            }
+        };
+        let put = |kind: io::ErrorKind| {
+            fs::write(&other, "new").unwrap();
+            let part = TempPath::try_from_path(&other).unwrap();
+            rename_new(part, &path, refuse(kind))
+        };
+        let gone = put(io::ErrorKind::AlreadyExists).unwrap_err();
+        assert_eq!(gone.kind(), io::ErrorKind::AlreadyExists);
+        assert!(!path.exists(), "told of by the system, and gone since");
+        put(io::ErrorKind::InvalidInput).unwrap();
+        assert_eq!(fs::read_to_string(&path).unwrap(), "new");
+        fs::write(&path, "there").unwrap();
+        let refused = put(io::ErrorKind::Unsupported).unwrap_err();
+        assert_eq!(refused.kind(), io::ErrorKind::Unsupported);
+        assert_eq!(fs::read_to_string(&path).unwrap(), "there");
     }
 
     #[test]
