@@ -421,6 +421,15 @@ fn only_what_cameras_see_counts() {
     }
     let seen = score_geometry(&behind, &reference, Some(&views[..1]), &options()).unwrap();
     assert_eq!((seen.accuracy.points, seen.faces_scored), (0, 0));
+    // Points hide nothing; no mesh at all is merely bad.
+    behind.faces.clear();
+    let refused = score_geometry(&behind, &reference, Some(&views), &options()).unwrap_err();
+    let told = refused.to_string();
+    assert!(
+        told.contains("no faces") && told.contains("without --visible-from"),
+        "{told}"
+    );
+    score_geometry(&Mesh::default(), &reference, Some(&views), &options()).unwrap();
 }
 
 #[test]

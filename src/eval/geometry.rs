@@ -128,7 +128,7 @@ pub struct GeometryScores {
 /// enough of them see counts.
 ///
 /// # Errors
-/// `Config` if the reference holds nothing inside the crop box, or options make no sense.
+/// `Config` if the reference holds nothing inside the crop box, options make no sense, or views are given for points without faces.
 pub fn score_geometry<V: Viewpoint>(
     mesh: &Mesh,
     reference: &Reference,
@@ -147,6 +147,13 @@ pub fn score_geometry<V: Viewpoint>(
         return Err(config(&format!(
             "{wrong} is no distance to compare with; next: positive thresholds and trim, and a reference that has an extent where they \
              follow from it"
+        )));
+    }
+    if views.is_some() && mesh.faces.is_empty() && !mesh.positions.is_empty() {
+        return Err(config(&format!(
+            "the mesh has {} points and no faces, so that it hides nothing and what views see of it cannot be told; next: give a mesh with \
+             faces, or score all points, without --visible-from",
+            mesh.positions.len()
         )));
     }
     let (samples, scored) = surface_samples(mesh, views, options);
