@@ -5,6 +5,7 @@ use std::io::{BufReader, Read};
 use std::path::{Path, PathBuf};
 
 use glam::{DMat4, DVec4};
+use half::f16;
 use npyz::{DType, NpyFile, Order, TypeChar};
 use zip::ZipArchive;
 
@@ -186,6 +187,7 @@ fn decode<T: Copy>(bytes: &[u8], of: impl Fn(f64) -> T) -> Result<Array<T>, Stri
     let values = match (kind.type_char(), size) {
         (TypeChar::Float, 8) => values!(f64, |x| x),
         (TypeChar::Float, 4) => values!(f32, f64::from),
+        (TypeChar::Float, 2) => values!(f16, f64::from),
         (TypeChar::Int, 8) => values!(i64, |x| x as f64),
         (TypeChar::Int, 4) => values!(i32, f64::from),
         (TypeChar::Int, 2) => values!(i16, f64::from),

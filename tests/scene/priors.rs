@@ -4,16 +4,16 @@ use std::fs;
 
 use image::{GrayImage, Luma};
 use neurodin::scene::{ObjectMasks, PriorKind, Scene};
-use npyz::WriterBuilder;
+use npyz::{AutoSerialize, WriterBuilder};
 use serde_json::json;
 
 use crate::fixtures::{Dataset, Rig, refused};
 
-fn write_npy(dataset: &Dataset, name: &str, shape: &[u64], values: &[f64]) {
+fn write_npy<T: AutoSerialize + Clone>(dataset: &Dataset, name: &str, shape: &[u64], values: &[T]) {
     let out = fs::File::create(dataset.at(name)).unwrap();
     let options = npyz::WriteOptions::new().default_dtype().shape(shape);
     let mut writer = options.writer(out).begin_nd().unwrap();
-    writer.extend(values).unwrap();
+    writer.extend(values.iter().cloned()).unwrap();
     writer.finish().unwrap();
 }
 
@@ -69,6 +69,16 @@ fn depths_and_normals_are_read_as_sdfstudio_writes_them() {
 }
 
 #[test]
+fn half_precision_is_read() {
+    let dataset = dataset(4);
+    let depth = vec![half::f16::from_f32(0.75); 64 * 48];
+    write_npy(&dataset, "depth.npy", &[48, 64], &depth);
+    let scene = dataset.open().unwrap();
+    let prior = scene.load_prior(0, PriorKind::MonoDepth).unwrap();
+    assert!(prior.values.iter().all(|&depth| depth == 0.75));
+}
+
+#[test]
 fn what_is_no_prior_of_its_picture_is_refused() {
     let dataset = dataset(3);
     let load = |view: usize, kind: PriorKind| dataset.open().unwrap().load_prior(view, kind);
@@ -94,7 +104,7 @@ fn what_is_no_prior_of_its_picture_is_refused() {
         load(0, PriorKind::MonoDepth),
         &["[2, 48, 64]", "[height, width]"],
     );
-    write_npy(&dataset, "depth.npy", &[0, 64], &[]);
+    write_npy(&dataset, "depth.npy", &[0, 64], &[0.0; 0]);
     refused(load(0, PriorKind::MonoDepth), &["64x0"]);
     write_npy(&dataset, "depth.npy", &[48, 64], &[f64::NAN; 48 * 64]);
     refused(load(0, PriorKind::MonoDepth), &["holds no value"]);
