@@ -11,8 +11,14 @@ use zip::ZipArchive;
 
 use crate::{Error, Result};
 
-/// Larger than any array of a dataset; an archive may claim more than memory holds.
-const LARGEST: u64 = 4 << 30;
+/// How many times larger than its archive an array may be, beside what it is granted anyway: a small archive may hold more than memory
+/// does. Measured numbers shrink to a tenth at best, equal ones to a thousandth.
+const GROWTH: u64 = 32;
+
+/// Bytes that arrays are granted: matrices, numbers, and flags such as whether a voxel was seen, which are mostly equal.
+const MATRIX: u64 = 4 << 10;
+const NUMBERS: u64 = 64 << 20;
+const FLAGS: u64 = 1 << 30;
 
 const NEXT: &str = "copy the file again, or write it anew with numpy.save or numpy.savez";
 
@@ -23,7 +29,10 @@ pub(crate) struct Arrays {
 }
 
 enum Source {
-    Archive(ZipArchive<BufReader<File>>),
+    Archive {
+        archive: ZipArchive<BufReader<File>>,
+        size: u64,
+    },
     Single(Vec<u8>),
 }
 
@@ -46,7 +55,7 @@ impl Arrays {
                     let what = format!("is no .npz archive ({size} bytes): {error}");
                     Error::input(file, what, NEXT)
                 })?;
-                Source::Archive(archive)
+                Source::Archive { archive, size }
             }
             Some("npy") => Source::Single(std::fs::read(file).map_err(unreadable)?),
             Some("mat") => {
@@ -71,7 +80,7 @@ impl Arrays {
     /// The names of all arrays; a single one has none.
     pub fn names(&self) -> Vec<String> {
         match &self.source {
-            Source::Archive(archive) => archive
+            Source::Archive { archive, .. } => archive
                 .file_names()
                 .filter_map(|name| Some(name.ok()?.strip_suffix(".npy")?.to_owned()))
                 .collect(),
@@ -81,17 +90,17 @@ impl Arrays {
 
     /// The array `name` of an archive, or the only one of a single file.
     pub fn numbers(&mut self, name: &str) -> Result<Array<f64>> {
-        self.read(name, |number| number)
+        self.read(name, NUMBERS, |number| number)
     }
 
     /// The same as truth values: whatever is not zero is true.
     pub fn flags(&mut self, name: &str) -> Result<Array<bool>> {
-        self.read(name, |number| number != 0.0)
+        self.read(name, FLAGS, |number| number != 0.0)
     }
 
     /// A matrix of four rows, or the upper three, of finite numbers.
     pub fn matrix(&mut self, name: &str) -> Result<DMat4> {
-        let Array { shape, values } = self.numbers(name)?;
+        let Array { shape, values } = self.read(name, MATRIX, |number| number)?;
         if shape != [4, 4] && shape != [3, 4] {
             let what = format!("{name} has the shape {shape:?}, not that of a 4x4 matrix");
             return Err(Error::input(&self.file, what, "export the cameras again"));
@@ -112,12 +121,17 @@ impl Arrays {
         Ok(DMat4::from_cols(rows[0], rows[1], rows[2], rows[3]).transpose())
     }
 
-    fn read<T: Copy>(&mut self, name: &str, of: impl Fn(f64) -> T) -> Result<Array<T>> {
+    fn read<T: Copy>(
+        &mut self,
+        name: &str,
+        granted: u64,
+        of: impl Fn(f64) -> T,
+    ) -> Result<Array<T>> {
         let file = self.file.clone();
         let there = self.names();
         let bytes = match &mut self.source {
             Source::Single(bytes) => std::mem::take(bytes),
-            Source::Archive(archive) => {
+            Source::Archive { archive, size } => {
                 let entry = archive.by_name(&format!("{name}.npy")).map_err(|error| {
                     let what = match there.iter().any(|other| other == name) {
                         true => format!("{name} cannot be read: {error}"),
@@ -126,12 +140,19 @@ impl Arrays {
                     Error::input(&file, what, "give the file that has it")
                 })?;
                 let mut bytes = Vec::new();
+                let most = granted.saturating_add(size.saturating_mul(GROWTH));
                 entry
-                    .take(LARGEST)
+                    .take(most.saturating_add(1))
                     .read_to_end(&mut bytes)
                     .map_err(|error| {
                         Error::input(&file, format!("{name} cannot be read: {error}"), NEXT)
                     })?;
+                if bytes.len() as u64 > most {
+                    let what =
+                        format!("{name} has more than {most} bytes, in an archive of {size}");
+                    let next = "if it is meant to be that large, write it anew with numpy.savez, which does not compress";
+                    return Err(Error::input(&file, what, next));
+                }
                 bytes
             }
         };
@@ -233,4 +254,42 @@ fn row_major<T: Copy>(shape: &[usize], stored: &[T]) -> Vec<T> {
         }
     }
     values
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use npyz::WriterBuilder;
+    use std::io::Write;
+    use zip::write::{SimpleFileOptions, ZipWriter};
+
+    /// A million equal numbers shrink to a thousandth: fine for an array, too many for a matrix.
+    #[test]
+    fn what_an_archive_inflates_to_is_limited_by_what_it_is_for() {
+        let mut array = Vec::new();
+        let options = npyz::WriteOptions::new().default_dtype();
+        let mut writer = options
+            .shape(&[1000, 1000])
+            .writer(&mut array)
+            .begin_nd()
+            .unwrap();
+        writer.extend(vec![0.5f64; 1_000_000]).unwrap();
+        writer.finish().unwrap();
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("arrays.npz");
+        let mut archive = ZipWriter::new(File::create(&file).unwrap());
+        let options = SimpleFileOptions::default();
+        let deflated = options.compression_method(zip::CompressionMethod::Deflated);
+        archive.start_file("equal.npy", deflated).unwrap();
+        archive.write_all(&array).unwrap();
+        archive.finish().unwrap();
+
+        let mut arrays = Arrays::open(&file).unwrap();
+        assert_eq!(arrays.numbers("equal").unwrap().values.len(), 1_000_000);
+        let refused = arrays.matrix("equal").unwrap_err().to_string();
+        assert!(
+            refused.contains("equal has more than") && refused.contains("numpy.savez"),
+            "{refused}"
+        );
+    }
 }
