@@ -68,8 +68,15 @@ impl Document<'_> {
     pub(super) fn hold_out_test_frames(&self, reading: &mut Reading) -> Result<()> {
         const KEY: &str = "test_frames";
         if self.top.get(KEY).is_some_and(|list| !list.is_null()) {
-            let test = self.frames(KEY, &reading.root, &mut reading.skipped)?;
+            let mut bad = Vec::new();
+            let test = self.frames(KEY, &reading.root, &mut bad)?;
             hold_out(reading, test, KEY);
+            // What is too bad to be held out is not trained on instead.
+            let bad_names: HashSet<&String> = bad.iter().map(|bad| &bad.what).collect();
+            reading
+                .frames
+                .retain(|frame| !bad_names.contains(&frame.name));
+            reading.skipped.extend(bad);
         }
         Ok(())
     }
