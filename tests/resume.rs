@@ -280,6 +280,30 @@ fn losses_that_are_not_finite_lead_back_to_the_last_checkpoint() {
     assert!(text.contains("not been finite for 10 steps"), "{text}");
 }
 
+/// A preview is for people: a run goes on without it.
+#[test]
+fn a_preview_that_cannot_be_written_ends_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    let scene = scene(folder.path());
+    let gpu = Gpu::new(&GpuOptions::default()).unwrap();
+    let config = of_every_kind().with_toml("steps = 6\nreport.preview_steps = 3", "test");
+    let config = config.and_then(Config::validated).unwrap();
+    let run = RunDirectory::create(&folder.path().join("run"), false).unwrap();
+    fs::remove_dir(run.previews()).unwrap();
+    let mut warnings = Vec::new();
+    let mut trainer = Trainer::new(&gpu, &scene, &sphere(1.1), &config).unwrap();
+    let mut tell = |event: Event| {
+        if let Event::Warning { what, .. } = event {
+            warnings.push(what);
+        }
+        Control::Continue
+    };
+    trainer.run(&scene, &run, &mut tell).unwrap();
+    assert_eq!(trainer.steps_done(), 6);
+    assert_eq!(warnings.len(), 2, "{warnings:?}");
+    assert!(warnings[0].contains("no preview"), "{warnings:?}");
+}
+
 /// What the second stage goes back to before its own first checkpoint is the end of the first stage: its parameters, but not its moments.
 #[test]
 fn a_second_stage_that_goes_back_begins_anew() {

@@ -22,6 +22,7 @@ pub(super) fn flag(context: &Context, then: &'static str) -> anyhow::Result<Arc<
     }
     let flag = Arc::new(AtomicBool::new(false));
     let (set, context) = (Arc::clone(&flag), context.clone());
+    let ignored = ignored();
     ctrlc::set_handler(move || {
         if set.swap(true, Ordering::SeqCst) {
             std::process::exit(130);
@@ -29,8 +30,41 @@ pub(super) fn flag(context: &Context, then: &'static str) -> anyhow::Result<Arc<
         let then = *THEN.lock().unwrap_or_else(PoisonError::into_inner);
         context.say(&format!("interrupted: {then}; once more stops at once"));
     })?;
+    ignore(&ignored);
     Ok(Arc::clone(HANDLER.get_or_init(|| flag)))
 }
+
+/// Requests that whoever started the program wants ignored, as `nohup` does with the terminal's end.
+#[cfg(unix)]
+fn ignored() -> Vec<libc::c_int> {
+    let mut requests = vec![libc::SIGINT, libc::SIGTERM, libc::SIGHUP];
+    requests.retain(|&request| {
+        // SAFETY: plain numbers and a null pointer, for which zero is a value; the call writes what is in force, and changes nothing.
+        let (read, now) = unsafe {
+            let mut now: libc::sigaction = std::mem::zeroed();
+            (
+                libc::sigaction(request, std::ptr::null(), &raw mut now),
+                now,
+            )
+        };
+        read == 0 && now.sa_sigaction == libc::SIG_IGN
+    });
+    requests
+}
+
+#[cfg(unix)]
+fn ignore(requests: &[libc::c_int]) {
+    for &request in requests {
+        // SAFETY: no handler of ours is named.
+        unsafe { libc::signal(request, libc::SIG_IGN) };
+    }
+}
+
+#[cfg(not(unix))]
+fn ignored() {}
+
+#[cfg(not(unix))]
+fn ignore(_: &()) {}
 
 /// [`Error::Interrupted`], in these words, once an end was asked for.
 ///

@@ -104,6 +104,11 @@ impl Trainer {
                     }
                     Ok(None) => {}
                     Err(Error::Interrupted { .. }) => stopping = true,
+                    // A picture that is not there any more, or cannot be written: no reason to end what trains well without it.
+                    Err(error @ (Error::Input { .. } | Error::Output { .. })) => {
+                        let what = format!("no preview: {error}");
+                        stopping |= tell(Event::Warning { step, what });
+                    }
                     Err(error) => return Err(error),
                 }
             }

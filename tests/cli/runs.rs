@@ -213,6 +213,21 @@ fn a_run_from_photographs_to_mesh() {
     assert_eq!(scored.code, Some(0), "{}", scored.stderr);
 }
 
+/// The same command as a shell's child that ignores the end of its terminal.
+#[cfg(unix)]
+fn under_nohup(command: &Command) -> Command {
+    let mut shell = Command::new("sh");
+    shell.args(["-c", r#"trap "" HUP; exec "$0" "$@""#]);
+    shell.arg(command.get_program()).args(command.get_args());
+    for (name, value) in command.get_envs() {
+        match value {
+            Some(value) => shell.env(name, value),
+            None => shell.env_remove(name),
+        };
+    }
+    shell
+}
+
 /// The first interrupt saves and exits 130, and the run goes on from exactly there.
 #[test]
 #[cfg(unix)]
@@ -237,7 +252,8 @@ fn an_interrupted_run_is_saved_and_goes_on() {
         ],
         &SMALL[..],
     ];
-    let child = neurodin(&words.concat())
+    let train = neurodin(&words.concat());
+    let child = under_nohup(&train)
         .stderr(Stdio::piped())
         .stdout(Stdio::null())
         .spawn()
@@ -248,11 +264,21 @@ fn an_interrupted_run_is_saved_and_goes_on() {
         assert!(Instant::now() < deadline, "it never trained");
         std::thread::sleep(Duration::from_millis(20));
     }
-    let killed = Command::new("kill")
-        .args(["-INT", &child.id().to_string()])
-        .status()
-        .unwrap();
-    assert!(killed.success());
+    let send = |signal: &str| {
+        let killed = Command::new("kill")
+            .args([signal, &child.id().to_string()])
+            .status()
+            .unwrap();
+        assert!(killed.success());
+    };
+    send("-HUP");
+    let lines = || fs::read_to_string(&log).unwrap().lines().count();
+    let before = lines();
+    while lines() < before + 3 {
+        assert!(Instant::now() < deadline, "it goes on without a terminal");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    send("-INT");
     let stopped = said(child.wait_with_output().unwrap());
     assert_eq!(stopped.code, Some(130), "{}", stopped.stderr);
     assert!(stopped.stderr.contains("--resume"), "{}", stopped.stderr);
