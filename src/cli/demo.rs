@@ -43,7 +43,7 @@ Example:
   neurodin demo --minutes 2 --resolution 256
 
 Writes to the output directory: dataset/ (photographs, cameras, ground truth), run/ (settings, log, previews, checkpoints),
-mesh.ply, scores.json, pictures/ and report.html.")]
+mesh.ply, scores.json, pictures/, report.html, and demo.txt, by which --force knows that they are a demo's.")]
 pub(super) struct DemoArgs {
     /// Directory to write
     #[arg(short, long, value_name = "DIR", default_value = "demo-out")]
@@ -159,13 +159,19 @@ impl<'c> Demo<'c> {
         let occupied =
             fs::read_dir(out).map_or(out.exists(), |mut entries| entries.next().is_some());
         if occupied {
-            if !args.force || !out.join(DATASET).join("transforms.json").is_file() {
+            if !args.force || !out.join(MARKER).is_file() {
                 return Err(Error::output(
                     out,
                     "exists already",
                     "give another --out, or replace a former demo's with --force",
                 )
                 .into());
+            }
+            // Nothing is removed before there is a device to make it again, nor while another demo is at work there.
+            context.gpu()?;
+            let run = out.join(RUN);
+            if RunDirectory::open(&run).is_ok() {
+                RunDirectory::resume(&run)?;
             }
             for entry in [DATASET, RUN, PICTURES] {
                 let path = out.join(entry);
@@ -175,6 +181,8 @@ impl<'c> Demo<'c> {
             }
         }
         fs::create_dir_all(out).map_err(|e| Error::unwritable(out, &e))?;
+        let says = "Made by neurodin demo, which replaces its own files and folders here when given --force.\n";
+        write_file(&out.join(MARKER), says.as_bytes())?;
         Ok(Demo {
             args,
             context,
@@ -401,6 +409,8 @@ impl<'c> Demo<'c> {
     }
 }
 
+/// By this file a folder is known as a demo's: what lies beside it may be replaced.
+const MARKER: &str = "demo.txt";
 const DATASET: &str = "dataset";
 const RUN: &str = "run";
 const MESH: &str = "mesh.ply";

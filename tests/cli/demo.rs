@@ -61,10 +61,21 @@ fn a_small_demo_goes_all_the_way() {
     assert_eq!(again.code, Some(8));
     assert_eq!(fs::read_to_string(out.join("report.html")).unwrap(), page);
 
-    // Nor does it ever remove what no demo has written.
+    // Nor does it remove that before it has a device.
+    let words = ["demo", "--force", "--device", "nosuch", "--out"];
+    fails(
+        &[&words[..], &[out.to_str().unwrap()]].concat(),
+        4,
+        &["nosuch"],
+    );
+    assert!(out.join("dataset/transforms.json").is_file());
+
+    // Nor, ever, what no demo has written.
     let mine = folder.path().join("mine");
     fs::create_dir(&mine).unwrap();
     fs::write(mine.join("mesh.ply"), "precious").unwrap();
+    fs::create_dir(mine.join("dataset")).unwrap();
+    fs::write(mine.join("dataset/transforms.json"), "{}").unwrap();
     fails(
         &["demo", "--force", "--out", mine.to_str().unwrap()],
         8,
@@ -74,4 +85,5 @@ fn a_small_demo_goes_all_the_way() {
         fs::read_to_string(mine.join("mesh.ply")).unwrap(),
         "precious"
     );
+    assert!(mine.join("dataset/transforms.json").is_file());
 }
