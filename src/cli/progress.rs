@@ -12,6 +12,8 @@ const INTERVAL: Duration = Duration::from_secs(10);
 pub struct Progress {
     what: String,
     total: u64,
+    /// Units from the first on take the second times as long.
+    slower: (u64, f64),
     pace: Pace,
     bar: Option<ProgressBar>,
     plain: bool,
@@ -33,6 +35,7 @@ impl Progress {
         Progress {
             what: what.into(),
             total,
+            slower: (total, 1.0),
             pace: Pace::default(),
             plain: context.tells_progress() && bar.is_none(),
             bar,
@@ -40,12 +43,18 @@ impl Progress {
         }
     }
 
+    /// The same, if the units from this one on will take `times` as long as those before, which is all that is known of them until then.
+    pub fn slower_from(mut self, unit: u64, times: f64) -> Progress {
+        self.slower = (unit, times);
+        self
+    }
+
     /// `done` units are done; `note` is what else there is to say.
     pub fn at(&mut self, done: u64, note: &str) {
         self.pace.mark(done);
         let text = || {
             let per_second = self.pace.per_second();
-            let left = self.pace.left(self.total);
+            let left = self.pace.left(left(done, self.total, self.slower));
             let mut text = format!("{done}/{}", self.total);
             if per_second > 0.0 {
                 text += &format!("  {}/s", three_digits(per_second));
@@ -80,6 +89,15 @@ impl Drop for Progress {
     }
 }
 
+/// What is left of `total`, in units as long as those at `done`, if those from the border on take so many times as long.
+fn left(done: u64, total: u64, (border, times): (u64, f64)) -> f64 {
+    let left = |from: u64| total.saturating_sub(from) as f64;
+    match done < border {
+        true => left(done) + (times - 1.0) * left(border),
+        false => left(done),
+    }
+}
+
 /// "0.123", "1.23", "12.3", "123", "1234".
 fn three_digits(number: f64) -> String {
     let decimals = match number {
@@ -104,6 +122,16 @@ pub fn clock(duration: Duration) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn what_is_left_counts_slower_units_for_more() {
+        let slower = [0, 79, 80, 100].map(|done| left(done, 100, (80, 3.0)));
+        assert_eq!(slower, [140.0, 61.0, 20.0, 0.0]);
+        assert_eq!(
+            [0, 99].map(|done| left(done, 100, (100, 1.0))),
+            [100.0, 1.0]
+        );
+    }
 
     #[test]
     fn numbers_for_people() {

@@ -218,17 +218,39 @@ fn begin(args: &TrainArgs, out: &Path, context: &Context) -> anyhow::Result<Task
         context.warn(doubt);
     }
     let gpu = context.gpu_with(gpu_options(&config))?;
+    let later = later_bytes(&gpu, &scene, &region, &config)?;
     let task = Task::new(&gpu, dataset, scene, &region, config, out)?;
-    say_device(&gpu, args.dry_run, context);
+    say_device(&gpu, later, args.dry_run, context);
     Ok(task)
 }
 
-/// The device, and what of its memory is used from here to the end: everything is allocated before the first step.
-fn say_device(gpu: &Gpu, in_full: bool, context: &Context) {
+/// Device memory of the stage that comes after this one, if any. It may need more: that it fits is tried before the first step, not found out
+/// at the end of a long stage.
+fn later_bytes(gpu: &Gpu, scene: &Scene, region: &Region, config: &Config) -> Result<Option<u64>> {
+    let Some(second) = config.second_stage() else {
+        return Ok(None);
+    };
+    match Trainer::new(gpu, scene, region, &second) {
+        Ok(trainer) => Ok(Some(trainer.gpu().memory_plan().total)),
+        Err(Error::OutOfMemory { what }) => Err(Error::OutOfMemory {
+            what: format!(
+                "stage 2 would not fit with stage2.rays = {} (--set stage2.rays=N)\n  {what}",
+                second.rays
+            ),
+        }),
+        Err(error) => Err(error),
+    }
+}
+
+/// The device, and what of its memory is used from here to the end: everything is allocated before a stage's first step.
+fn say_device(gpu: &Gpu, later: Option<u64>, in_full: bool, context: &Context) {
     let plan = gpu.memory_plan();
     let mib = |bytes: u64| bytes as f64 / f64::from(1 << 20);
+    let later = later.map_or(String::new(), |bytes| {
+        format!(", then {:.0} MiB for stage 2", mib(bytes))
+    });
     context.say(&format!(
-        "device   {}: {:.0} MiB in {} buffers, of {:.0} MiB",
+        "device   {}: {:.0} MiB in {} buffers{later}, of {:.0} MiB",
         gpu.info().name,
         mib(plan.total),
         plan.buffers.len(),
@@ -237,6 +259,11 @@ fn say_device(gpu: &Gpu, in_full: bool, context: &Context) {
     if in_full {
         context.say(&plan.to_string());
     }
+}
+
+/// About how many times as long as a step of the first stage one of the second takes: at equal rays three quarters (tools/runs/throughput.md).
+fn times_as_long(config: &Config) -> f64 {
+    0.75 * f64::from(config.stage2.rays) / f64::from(config.rays)
 }
 
 /// How long the stages are.
@@ -412,9 +439,10 @@ fn resume(args: &TrainArgs, out: &Path, context: &Context) -> anyhow::Result<Tas
         record.move_to(moved)?;
     }
     let gpu = context.gpu_with(gpu_options(&config))?;
+    let later = later_bytes(&gpu, &scene, &state.region, &stage)?;
     let mut trainer = Trainer::new(&gpu, &scene, &state.region, &stage)?;
     trainer.restore(&latest.checkpoint)?;
-    say_device(&gpu, args.dry_run, context);
+    say_device(&gpu, later, args.dry_run, context);
     diagnostics::note_checkpoint(latest.checkpoint.path());
     Ok(Task {
         out: out.into(),
@@ -462,10 +490,14 @@ impl Task {
         };
         run.write(&run.scene(), &self.record.to_json())?;
         run.write(&run.config(), &self.config.to_toml())?;
+        let total = self.config.total_steps();
         let mut teller = Teller {
             context,
             log: Log::append(&run.log())?,
-            progress: Progress::new(context, "train", self.config.total_steps()),
+            progress: Progress::new(context, "train", total).slower_from(
+                total - self.config.stage2.steps,
+                times_as_long(&self.config),
+            ),
             interrupted: &interrupted,
             note: String::new(),
             failed: None,

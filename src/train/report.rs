@@ -224,12 +224,10 @@ impl Pace {
         }
     }
 
-    /// Time for the units that are left, as long as there is a speed.
-    pub fn left(&self, total: u64) -> Option<Duration> {
-        let (_, done) = self.marks.back()?;
+    /// Time for so many more units, as long as there is a speed.
+    pub fn left(&self, units: f64) -> Option<Duration> {
         let rate = self.per_second();
-        (rate > 0.0)
-            .then(|| Duration::from_secs_f64((total.saturating_sub(*done) as f64 / rate).min(1e9)))
+        (rate > 0.0).then(|| Duration::from_secs_f64((units / rate).min(1e9)))
     }
 }
 
@@ -316,7 +314,7 @@ mod tests {
     fn pace_follows_the_last_half_minute() {
         let start = Instant::now();
         let mut pace = Pace::default();
-        assert_eq!((pace.per_second(), pace.left(10)), (0.0, None));
+        assert_eq!((pace.per_second(), pace.left(10.0)), (0.0, None));
         for second in 0..=100 {
             let done = if second <= 50 {
                 second * 100
@@ -326,7 +324,7 @@ mod tests {
             pace.mark_at(start + Duration::from_secs(second), done);
         }
         assert_eq!(pace.per_second(), 10.0);
-        assert_eq!(pace.left(6_500), Some(Duration::from_secs(100)));
+        assert_eq!(pace.left(1_000.0), Some(Duration::from_secs(100)));
         pace.mark_at(start + Duration::from_secs(300), 5_600);
         assert_eq!(pace.per_second(), 0.5, "a step longer than the window");
     }
