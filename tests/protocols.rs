@@ -558,6 +558,10 @@ fn what_a_protocol_lacks_is_said() {
         &["--trim is for --protocol plain"],
     );
     files.refuses(
+        &format!("{tnt} --scene Barn --samples 9"),
+        &["--samples is for --protocol plain"],
+    );
+    files.refuses(
         "--mesh a.ply --reference a.ply --plane plane.npz",
         &["--plane is for --protocol dtu, not plain"],
     );

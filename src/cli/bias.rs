@@ -39,6 +39,9 @@ pub(super) struct BiasArgs {
     /// Directory for pictures; of a dataset, for the two runs, too
     #[arg(short, long, value_name = "DIR")]
     pub out: Option<PathBuf>,
+    /// Where the run's dataset is now, if it has moved
+    #[arg(long, value_name = "DATASET", conflicts_with = "plane")]
+    pub dataset: Option<PathBuf>,
     /// Held-out views to look at
     #[arg(long, value_name = "N", default_value_t = 2, value_parser = clap::value_parser!(u64).range(1..))]
     pub views: u64,
@@ -234,7 +237,8 @@ fn measure(
     let directory = RunDirectory::open(run)?;
     let gpu = context.gpu()?;
     let trained = Trained::open(&gpu, &directory)?;
-    let mut scene = trained.record.open(None, trained.config())?;
+    let moved = args.dataset.as_deref();
+    let mut scene = trained.record.open(moved, trained.config())?;
     let views: Vec<usize> = scene.split(Split::Test).take(args.views as usize).collect();
     if views.is_empty() {
         let next = "train with a --holdout of at most half as many as there are views";

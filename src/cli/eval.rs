@@ -45,32 +45,37 @@ pub struct EvalArgs {
         value_enum,
         default_value_t,
         value_name = "SPLIT",
-        requires = "run"
+        conflicts_with = "mesh"
     )]
     pub split: Which,
     /// Appearance code of the rendered views [default: as the run's settings say]
-    #[arg(long, value_enum, value_name = "CODE", requires = "run")]
+    #[arg(long, value_enum, value_name = "CODE", conflicts_with = "mesh")]
     pub appearance: Option<Appearance>,
     /// Where the run's dataset is now, if it has moved
-    #[arg(long, value_name = "DATASET", requires = "run")]
+    #[arg(long, value_name = "DATASET", conflicts_with = "mesh")]
     pub dataset: Option<PathBuf>,
     /// Mesh to score (PLY or OBJ); without faces, its points
     #[arg(long, value_name = "FILE", requires = "reference")]
     pub mesh: Option<PathBuf>,
     /// True surface as a mesh or a point cloud; given twice, accuracy is to the mesh and completeness from the points
-    #[arg(long, value_name = "FILE", requires = "mesh", conflicts_with = "run")]
+    #[arg(long, value_name = "FILE", conflicts_with = "run")]
     pub reference: Vec<PathBuf>,
     /// Distances for precision, recall and F-score [default: 0.5, 1 and 2 % of half the reference's diagonal]
-    #[arg(long, value_name = "A,B,..", value_delimiter = ',')]
+    #[arg(
+        long,
+        value_name = "A,B,..",
+        value_delimiter = ',',
+        conflicts_with = "run"
+    )]
     pub thresholds: Vec<f64>,
     /// Distances are cut off here for the trimmed Chamfer distance [default: 5 % of half the reference's diagonal]
-    #[arg(long, value_name = "D")]
+    #[arg(long, value_name = "D", conflicts_with = "run")]
     pub trim: Option<f64>,
     /// Score only what lies in this box
-    #[arg(long, value_name = "X0,Y0,Z0,X1,Y1,Z1", value_parser = numbers::<6>, allow_hyphen_values = true)]
+    #[arg(long, value_name = "X0,Y0,Z0,X1,Y1,Z1", value_parser = numbers::<6>, allow_hyphen_values = true, conflicts_with = "run")]
     pub crop: Option<[f64; 6]>,
     /// Leave out of the mesh what no training view of this dataset sees
-    #[arg(long, value_name = "DATASET")]
+    #[arg(long, value_name = "DATASET", conflicts_with = "run")]
     pub visible_from: Option<PathBuf>,
     /// Views that must see a place [default: 1]
     #[arg(long, value_name = "N", requires = "visible_from", value_parser = clap::value_parser!(u32).range(1..))]
@@ -79,7 +84,7 @@ pub struct EvalArgs {
     #[arg(long, value_name = "D", requires = "visible_from")]
     pub hidden_by: Option<f64>,
     /// Points drawn on a mesh (--protocol plain) [default: 500000]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=50_000_000))]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=50_000_000), conflicts_with = "run")]
     pub samples: Option<u32>,
     /// Seed of the points
     #[arg(long, value_name = "N", default_value_t = 0)]

@@ -203,6 +203,7 @@ fn exponential(start: f64, end: f64, x: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::config::PRESETS;
 
     /// What the schedules of NeuRodin's released code come to, rounded.
     #[test]

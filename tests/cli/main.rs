@@ -179,6 +179,10 @@ fn wrong_usage_exits_2_with_a_hint() {
         &["--resolution"],
     );
     fails(&["eval"], 2, &["--mesh"]);
+    // What would have no effect is refused.
+    fails(&["eval", "run", "--samples", "9"], 2, &["--samples"]);
+    let mesh = ["eval", "--mesh", "a.ply", "--reference", "b.ply"];
+    fails(&[&mesh[..], &["--split", "all"]].concat(), 2, &["--split"]);
     fails(&["train", "-q", "-v", "x", "--out", "y"], 2, &["--quiet"]);
     let colored = run(&["--color", "always", "trian"]).stderr;
     assert!(colored.contains("\x1b["), "{colored}");

@@ -23,23 +23,23 @@ pub struct ProtocolArgs {
         value_enum,
         default_value_t,
         value_name = "NAME",
-        requires = "mesh"
+        conflicts_with = "run"
     )]
     pub protocol: Protocol,
     /// From the mesh's coordinates to the reference's: 4 rows of 4 numbers as text (*_trans.txt) or .npy, or a meta_data.json with worldtogt
-    #[arg(long, value_name = "FILE", requires = "mesh")]
+    #[arg(long, value_name = "FILE", conflicts_with = "run")]
     pub align: Option<PathBuf>,
     /// tnt: the scene, which has its own threshold; --thresholds states one for others
-    #[arg(long, value_name = "SCENE", requires = "mesh")]
+    #[arg(long, value_name = "SCENE", conflicts_with = "run")]
     pub scene: Option<String>,
     /// tnt: the scene's polygon, a SelectionPolygonVolume in JSON
-    #[arg(long, value_name = "FILE", requires = "mesh")]
+    #[arg(long, value_name = "FILE", conflicts_with = "run")]
     pub crop_polygon: Option<PathBuf>,
     /// dtu: ObsMask, BB and Res of the scan, as .npz
-    #[arg(long, value_name = "FILE", requires = "mesh")]
+    #[arg(long, value_name = "FILE", conflicts_with = "run")]
     pub observed: Option<PathBuf>,
     /// dtu: the table's plane P, as .npz or .npy
-    #[arg(long, value_name = "FILE", requires = "mesh")]
+    #[arg(long, value_name = "FILE", conflicts_with = "run")]
     pub plane: Option<PathBuf>,
 }
 
@@ -66,7 +66,8 @@ impl Protocol {
 pub(super) fn check_flags(args: &EvalArgs) -> Result<()> {
     use Protocol::{Dtu, Plain, Tnt};
     let protocols = &args.protocols;
-    let flags: [(&str, bool, &[Protocol]); 9] = [
+    let flags: [(&str, bool, &[Protocol]); 10] = [
+        ("--samples", args.samples.is_some(), &[Plain]),
         ("--crop", args.crop.is_some(), &[Plain]),
         ("--trim", args.trim.is_some(), &[Plain]),
         ("--visible-from", args.visible_from.is_some(), &[Plain]),
