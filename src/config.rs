@@ -115,7 +115,7 @@ impl Config {
 pub struct SceneConfig {
     /// Sphere (objects, outdoors) or axis-parallel box (rooms).
     pub shape: RegionKind,
-    /// The estimated (or given) region is enlarged by this factor.
+    /// The region is enlarged by this factor, unless its size was typed.
     pub region_scale: f64,
     /// Every n-th view is held out where the dataset has no split of its own; 0 keeps all.
     pub holdout: u32,

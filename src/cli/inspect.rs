@@ -30,6 +30,9 @@ pub struct InspectArgs {
     /// Replace the preview if it exists
     #[arg(long)]
     pub force: bool,
+    /// The preset whose region to show; without it the one that `train` would take
+    #[arg(long, value_name = "NAME", env = "NEURODIN_PRESET")]
+    pub preset: Option<String>,
     #[command(flatten)]
     pub scene: SceneArgs,
 }
@@ -51,7 +54,11 @@ pub(super) fn run(args: &InspectArgs, context: &Context) -> anyhow::Result<()> {
     let scene = Scene::open(&args.dataset, &args.scene.options(&SceneOptions::default()))?;
     let suggestion = Suggestion::for_scene(&scene, &args.scene)?;
     // The one that `train` would take.
-    let Chosen { region, .. } = Chosen::of(&SettingsArgs::default(), &args.scene, &scene)?;
+    let settings = SettingsArgs {
+        preset: args.preset.clone(),
+        ..SettingsArgs::default()
+    };
+    let Chosen { region, .. } = Chosen::of(&settings, &args.scene, &scene)?;
     if let Some(preview) = &args.preview {
         write_preview(&scene, &region, preview)?;
     }

@@ -2,8 +2,9 @@
 
 use clap::Args;
 
-use crate::config::{Config, MaskUse, RegionKind};
+use crate::config::{Config, MaskUse};
 use crate::scene::{RegionOverrides, SceneOptions};
+use crate::train::run_directory::region_overrides;
 
 /// How to read the dataset, and the region to reconstruct.
 #[derive(Args, Clone, Debug, Default)]
@@ -48,7 +49,7 @@ impl SceneArgs {
         }
     }
 
-    /// `defaults`, with what was typed in place of it.
+    /// `defaults`, with what was typed in place of it. A size that was typed is not enlarged, unless that was typed, too.
     pub fn overrides(&self, defaults: &RegionOverrides) -> RegionOverrides {
         RegionOverrides {
             center: self.center.or(defaults.center),
@@ -57,18 +58,17 @@ impl SceneArgs {
                 .boxed
                 .map(|[x0, y0, z0, x1, y1, z1]| [[x0, y0, z0], [x1, y1, z1]])
                 .or(defaults.boxed),
-            scale: self.region_scale.unwrap_or(defaults.scale),
+            scale: match self.boxed.is_some() || self.radius.is_some() {
+                true => self.region_scale.unwrap_or(1.0),
+                false => self.region_scale.unwrap_or(defaults.scale),
+            },
             prefer_box: defaults.prefer_box,
         }
     }
 
     /// What these flags and a configuration say of the region.
     pub(super) fn region(&self, config: &Config) -> RegionOverrides {
-        self.overrides(&RegionOverrides {
-            scale: config.scene.region_scale,
-            prefer_box: config.scene.shape == RegionKind::Box,
-            ..RegionOverrides::default()
-        })
+        self.overrides(&region_overrides(config))
     }
 
     /// These flags' share of the settings, put into them.
@@ -136,6 +136,24 @@ mod tests {
             Some([[-1.0, -1.0, 0.0], [1.0, 1.0, 2.0]])
         );
         assert!(!typed.scene.options(&SceneOptions::default()).masks);
+    }
+
+    #[test]
+    fn a_size_that_was_typed_is_not_enlarged() {
+        let preset = RegionOverrides {
+            scale: 1.5,
+            ..RegionOverrides::default()
+        };
+        for (words, scale) in [
+            (&["x"][..], 1.5),
+            (&["x", "--center", "0,0,0"], 1.5),
+            (&["x", "--radius", "2"], 1.0),
+            (&["x", "--box", "0,0,0,1,1,1"], 1.0),
+            (&["x", "--radius", "2", "--region-scale", "3"], 3.0),
+        ] {
+            let typed = Typed::try_parse_from(words).unwrap();
+            assert_eq!(typed.scene.overrides(&preset).scale, scale, "{words:?}");
+        }
     }
 
     #[test]

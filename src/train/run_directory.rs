@@ -1,7 +1,7 @@
 //! Where a run keeps what it makes: a folder with `config.toml`, `scene.json`, `log.jsonl`, `previews/` and `ckpt/`.
 
-use crate::config::Config;
-use crate::scene::{Format, Region, Scene, SceneOptions, Split};
+use crate::config::{Config, RegionKind};
+use crate::scene::{Format, Region, RegionOverrides, Scene, SceneOptions, Split};
 use crate::{Error, Result, whole_file};
 use serde::{Deserialize, Serialize};
 use std::fs::{self, File};
@@ -218,6 +218,15 @@ pub struct ViewRecord {
     /// Of the picture as it is trained with.
     pub width: u32,
     pub height: u32,
+}
+
+/// Which region a configuration takes of a dataset.
+pub fn region_overrides(config: &Config) -> RegionOverrides {
+    RegionOverrides {
+        scale: config.scene.region_scale,
+        prefer_box: config.scene.shape == RegionKind::Box,
+        ..RegionOverrides::default()
+    }
 }
 
 fn absolute(dataset: &Path) -> Result<PathBuf> {

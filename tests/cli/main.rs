@@ -509,6 +509,15 @@ fn presets_are_suggested_and_contradicted() {
     assert_eq!(report["suggested"]["preset"], "outdoor-tiny");
     assert_eq!(report["suggested"]["settings"][0], "background.kind=field");
     assert_eq!(report["beyond"]["runs_on"], true);
+    // The region is the one that training takes, of the preset that is named.
+    let radius = |preset: &[&str]| {
+        let inspected = run(&[&["inspect", &photos, "--json"], preset].concat());
+        let report: Value = serde_json::from_str(&inspected.stdout).unwrap();
+        report["region"]["radius"].as_f64().unwrap()
+    };
+    let (tiny, large) = (radius(&[]), radius(&["--preset", "outdoor-large"]));
+    assert!((tiny / large - 1.5).abs() < 1e-9, "{tiny} {large}");
+    assert_eq!(radius(&["--radius", "2"]), 2.0);
     let text = run(&["inspect", &photos]).stderr;
     assert!(
         text.contains("--preset outdoor-tiny --set background.kind=field"),
