@@ -8,12 +8,12 @@ use clap::Args;
 use serde_json::{Value, json};
 
 use super::Context;
-use super::chosen::Chosen;
+use super::chosen::{Chosen, open_scene};
 use super::scene_args::SceneArgs;
 use super::settings::SettingsArgs;
 use super::suggestion::Suggestion;
 use crate::Error;
-use crate::scene::{Facing, Region, RegionShape, Scene, SceneOptions, Split, write_preview};
+use crate::scene::{Facing, Region, RegionShape, Scene, Split, write_preview};
 
 /// Say what a dataset holds, what was skipped, and which region would be reconstructed
 #[derive(Args, Clone, Debug)]
@@ -51,13 +51,13 @@ pub(super) fn run(args: &InspectArgs, context: &Context) -> anyhow::Result<()> {
         }
         .into());
     }
-    let scene = Scene::open(&args.dataset, &args.scene.options(&SceneOptions::default()))?;
-    let suggestion = Suggestion::for_scene(&scene, &args.scene)?;
-    // The one that `train` would take.
+    // As `train` would open it, for the region that it would take.
     let settings = SettingsArgs {
         preset: args.preset.clone(),
         ..SettingsArgs::default()
     };
+    let scene = open_scene(&settings, &args.scene, &args.dataset)?;
+    let suggestion = Suggestion::for_scene(&scene, &args.scene)?;
     let Chosen { region, .. } = Chosen::of(&settings, &args.scene, &scene)?;
     if let Some(preview) = &args.preview {
         write_preview(&scene, &region, preview)?;
@@ -96,7 +96,6 @@ fn report(
         "views": {
             "train": scene.split(Split::Train).count(),
             "test": scene.split(Split::Test).count(),
-            "masked": scene.views.iter().filter(|view| view.mask_path.is_some()).count(),
         },
         "cameras": cameras,
         "points": scene.points.len(),
@@ -130,19 +129,11 @@ fn as_text(
         scene.split(Split::Train).count(),
         scene.split(Split::Test).count(),
     );
-    let masked = scene
-        .views
-        .iter()
-        .filter(|view| view.mask_path.is_some())
-        .count();
     row(
         "dataset",
         format!("{}, {}", scene.root.display(), scene.format),
     );
-    row(
-        "views",
-        format!("{train} to train on, {test} held out, {masked} with masks"),
-    );
+    row("views", format!("{train} to train on, {test} held out"));
     for ((model, width, height), views) in cameras(scene) {
         row("camera", format!("{model} {width}x{height}, {views} views"));
     }

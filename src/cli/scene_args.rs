@@ -3,7 +3,7 @@
 use clap::Args;
 
 use crate::config::{Config, MaskUse};
-use crate::scene::{RegionOverrides, SceneOptions};
+use crate::scene::RegionOverrides;
 use crate::train::run_directory::region_overrides;
 
 /// How to read the dataset, and the region to reconstruct.
@@ -40,15 +40,6 @@ pub struct SceneArgs {
 }
 
 impl SceneArgs {
-    /// `defaults`, with what was typed in place of it.
-    pub fn options(&self, defaults: &SceneOptions) -> SceneOptions {
-        SceneOptions {
-            downscale: self.downscale.unwrap_or(defaults.downscale),
-            holdout: self.holdout.unwrap_or(defaults.holdout),
-            masks: defaults.masks && !self.no_masks,
-        }
-    }
-
     /// `defaults`, with what was typed in place of it. A size that was typed is not enlarged, unless that was typed, too.
     pub fn overrides(&self, defaults: &RegionOverrides) -> RegionOverrides {
         RegionOverrides {
@@ -135,7 +126,10 @@ mod tests {
             typed.scene.overrides(&RegionOverrides::default()).boxed,
             Some([[-1.0, -1.0, 0.0], [1.0, 1.0, 2.0]])
         );
-        assert!(!typed.scene.options(&SceneOptions::default()).masks);
+        let mut config = Config::default();
+        config.scene.masks = MaskUse::Exclude;
+        let config = typed.scene.put_into(config).unwrap();
+        assert_eq!(config.scene.masks, MaskUse::Ignore);
     }
 
     #[test]

@@ -277,6 +277,7 @@ impl Scene {
             .iter()
             .any(|(frame, _)| frame.split == Some(Split::Test));
         let mut resized: Vec<String> = Vec::new();
+        let mut unused_masks = 0;
         for ((frame, image_path), header) in frames.into_iter().zip(headers) {
             let camera = frame_camera(&reading.file, &frame, &image_path, &header, &mut resized)?;
             let reduced = |side: u32| ((f64::from(side) / options.downscale).round() as u32).max(1);
@@ -286,7 +287,14 @@ impl Scene {
                 camera.scaled(reduced(camera.width), reduced(camera.height))
             };
             let mask_path = match frame.mask {
-                _ if !options.masks => None,
+                named if !options.masks => {
+                    let there = match named {
+                        Some(named) => named.is_ok(),
+                        None => images::find_mask(&scene.root, &image_path).is_some(),
+                    };
+                    unused_masks += u32::from(there);
+                    None
+                }
                 Some(Ok(path)) => Some(path),
                 Some(Err(why)) => {
                     return Err(Error::input(
@@ -305,6 +313,15 @@ impl Scene {
                 camera,
                 world_from_camera: frame.world_from_camera,
                 split: frame.split.unwrap_or(Split::Train),
+            });
+        }
+        if unused_masks > 0 {
+            scene.skipped.push(Skipped {
+                what: "masks".into(),
+                why: format!(
+                    "of {unused_masks} of {} views, not asked for: --set scene.masks=exclude or foreground uses them",
+                    scene.views.len()
+                ),
             });
         }
         if let Some(first) = resized.first() {

@@ -2,7 +2,7 @@
 
 use super::Trainer;
 use crate::config::Config;
-use crate::eval::images::compare;
+use crate::eval::images::{compare, keeps_any};
 use crate::render::Rendered;
 use crate::scene::{Camera, Picture, Scene, Split};
 use crate::srgb;
@@ -40,7 +40,8 @@ impl PreviewView {
 }
 
 impl Trainer {
-    /// Writes a preview: photograph, rendering and normals side by side. Returns the rendering's PSNR in dB, or `None` if there is no view.
+    /// Writes a preview: photograph, rendering and normals side by side. Returns the rendering's PSNR in dB, or `None` if there is no view or
+    /// its mask keeps nothing.
     ///
     /// # Errors
     /// [`Error::Interrupted`] once `stop` says so; [`Error::Output`] if it cannot be written; whatever reading the photograph and the
@@ -69,7 +70,8 @@ impl Trainer {
                 )
             })?;
         let masked = self.config.scene.masks.reads();
-        Ok(Some(compare(&rendered.rgb, &photo, masked).0))
+        let counts = !masked || keeps_any(&photo);
+        Ok(counts.then(|| compare(&rendered.rgb, &photo, masked).0))
     }
 }
 

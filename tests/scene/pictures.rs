@@ -93,11 +93,16 @@ fn assert_left_half_hidden(dataset: &Dataset, view: usize) {
         masks: false,
         ..all_views()
     };
-    let bare = Scene::open(dataset.path(), &options)
-        .unwrap()
-        .load_picture(view)
-        .unwrap();
-    assert!(bare.rgba.chunks(4).all(|pixel| pixel[3] == 255));
+    let bare = Scene::open(dataset.path(), &options).unwrap();
+    let picture = bare.load_picture(view).unwrap();
+    assert!(picture.rgba.chunks(4).all(|pixel| pixel[3] == 255));
+    // A mask is said to be there; an alpha channel is looked at no sooner than its picture.
+    let masked = dataset.open().unwrap().views[view].mask_path.is_some();
+    let said = bare
+        .skipped
+        .iter()
+        .filter(|skipped| skipped.what == "masks");
+    assert_eq!(said.count(), usize::from(masked), "{:?}", bare.skipped);
 }
 
 #[test]
