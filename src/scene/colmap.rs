@@ -29,7 +29,15 @@ const PLACES: [&str; 8] = [
 ];
 
 /// Where pictures may lie below a dataset's directory.
-const IMAGE_FOLDERS: [&str; 6] = ["images", "image", "rgb", "input", "imgs", ""];
+const IMAGE_FOLDERS: [&str; 7] = [
+    "images",
+    "image",
+    "rgb",
+    "input",
+    "imgs",
+    "resized_images", // ScanNet++
+    "",
+];
 
 /// The directory of the COLMAP model that belongs to the dataset at `path`, if there is one.
 pub(super) fn find_model(path: &Path) -> Option<PathBuf> {
