@@ -5,6 +5,12 @@ use crate::{Error, Result};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
+#[cfg(unix)]
+use signal_hook::{
+    consts::{SIGHUP, SIGINT, SIGTERM},
+    iterator::Signals,
+};
+
 /// The process has one handler, whatever a command does one after another.
 static HANDLER: OnceLock<Arc<AtomicBool>> = OnceLock::new();
 /// What happens because of the first request, at this moment.
@@ -22,49 +28,43 @@ pub(super) fn flag(context: &Context, then: &'static str) -> anyhow::Result<Arc<
     }
     let flag = Arc::new(AtomicBool::new(false));
     let (set, context) = (Arc::clone(&flag), context.clone());
-    let ignored = ignored();
-    ctrlc::set_handler(move || {
+    listen(move || {
         if set.swap(true, Ordering::SeqCst) {
             std::process::exit(130);
         }
         let then = *THEN.lock().unwrap_or_else(PoisonError::into_inner);
         context.say(&format!("interrupted: {then}; once more stops at once"));
     })?;
-    ignore(&ignored);
     Ok(Arc::clone(HANDLER.get_or_init(|| flag)))
 }
 
-/// Requests that whoever started the program wants ignored, as `nohup` does with the terminal's end.
+/// Calls `asked` at every request to end: Ctrl-C, termination, and the terminal's end unless `nohup` wants that ignored.
 #[cfg(unix)]
-fn ignored() -> Vec<libc::c_int> {
-    let mut requests = vec![libc::SIGINT, libc::SIGTERM, libc::SIGHUP];
-    requests.retain(|&request| {
-        // SAFETY: plain numbers and a null pointer, for which zero is a value; the call writes what is in force, and changes nothing.
-        let (read, now) = unsafe {
-            let mut now: libc::sigaction = std::mem::zeroed();
-            (
-                libc::sigaction(request, std::ptr::null(), &raw mut now),
-                now,
-            )
-        };
-        read == 0 && now.sa_sigaction == libc::SIG_IGN
-    });
-    requests
-}
-
-#[cfg(unix)]
-fn ignore(requests: &[libc::c_int]) {
-    for &request in requests {
-        // SAFETY: no handler of ours is named.
-        unsafe { libc::signal(request, libc::SIG_IGN) };
+fn listen(asked: impl Fn() + Send + 'static) -> anyhow::Result<()> {
+    let mut requests = vec![SIGINT, SIGTERM];
+    if !is_ignored(SIGHUP) {
+        requests.push(SIGHUP);
     }
+    let mut requests = Signals::new(requests)?;
+    std::thread::spawn(move || requests.forever().for_each(|_| asked()));
+    Ok(())
+}
+
+/// Whether the program was started with this signal ignored, where that can be told without the system's own calls: on Linux.
+#[cfg(unix)]
+fn is_ignored(signal: i32) -> bool {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let mask = status
+        .lines()
+        .find_map(|line| line.strip_prefix("SigIgn:"))
+        .and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok());
+    mask.is_some_and(|mask| mask >> (signal - 1) & 1 == 1)
 }
 
 #[cfg(not(unix))]
-fn ignored() {}
-
-#[cfg(not(unix))]
-fn ignore(_: &()) {}
+fn listen(asked: impl Fn() + Send + 'static) -> anyhow::Result<()> {
+    Ok(ctrlc::set_handler(asked)?)
+}
 
 /// [`Error::Interrupted`], in these words, once an end was asked for.
 ///

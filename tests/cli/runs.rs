@@ -271,12 +271,14 @@ fn an_interrupted_run_is_saved_and_goes_on() {
             .unwrap();
         assert!(killed.success());
     };
-    send("-HUP");
-    let lines = || fs::read_to_string(&log).unwrap().lines().count();
-    let before = lines();
-    while lines() < before + 3 {
-        assert!(Instant::now() < deadline, "it goes on without a terminal");
-        std::thread::sleep(Duration::from_millis(20));
+    if cfg!(target_os = "linux") {
+        send("-HUP");
+        let lines = || fs::read_to_string(&log).unwrap().lines().count();
+        let before = lines();
+        while lines() < before + 3 {
+            assert!(Instant::now() < deadline, "it goes on without a terminal");
+            std::thread::sleep(Duration::from_millis(20));
+        }
     }
     send("-INT");
     let stopped = said(child.wait_with_output().unwrap());
