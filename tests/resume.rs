@@ -45,6 +45,19 @@ fn sphere(radius: f64) -> Region {
     }
 }
 
+/// Trains to the end; what it warns of on the way.
+fn run_to_the_end(trainer: &mut Trainer, scene: &Scene, run: &RunDirectory) -> Vec<String> {
+    let mut warnings = Vec::new();
+    let mut tell = |event: Event| {
+        if let Event::Warning { what, .. } = event {
+            warnings.push(what);
+        }
+        Control::Continue
+    };
+    trainer.run(scene, run, &mut tell).unwrap();
+    warnings
+}
+
 #[test]
 fn a_restored_run_takes_the_same_next_step() {
     restored_takes_the_same_next_step(&of_every_kind());
@@ -240,14 +253,7 @@ fn losses_that_are_not_finite_lead_back_to_the_last_checkpoint() {
     let mut trainer = trained(3);
     trainer.save(&run.checkpoints()).unwrap();
     poison(&trainer);
-    let mut warnings = Vec::new();
-    let mut tell = |event: Event| {
-        if let Event::Warning { what, .. } = event {
-            warnings.push(what);
-        }
-        Control::Continue
-    };
-    trainer.run(&scene, &run, &mut tell).unwrap();
+    let warnings = run_to_the_end(&mut trainer, &scene, &run);
     assert_eq!(trainer.steps_done(), 30);
     let losses = trainer.finish().unwrap().unwrap();
     assert!(
@@ -290,15 +296,8 @@ fn a_preview_that_cannot_be_written_ends_nothing() {
     let config = config.and_then(Config::validated).unwrap();
     let run = RunDirectory::create(&folder.path().join("run"), false).unwrap();
     fs::remove_dir(run.previews()).unwrap();
-    let mut warnings = Vec::new();
     let mut trainer = Trainer::new(&gpu, &scene, &sphere(1.1), &config).unwrap();
-    let mut tell = |event: Event| {
-        if let Event::Warning { what, .. } = event {
-            warnings.push(what);
-        }
-        Control::Continue
-    };
-    trainer.run(&scene, &run, &mut tell).unwrap();
+    let warnings = run_to_the_end(&mut trainer, &scene, &run);
     assert_eq!(trainer.steps_done(), 6);
     assert_eq!(warnings.len(), 2, "{warnings:?}");
     assert!(warnings[0].contains("no preview"), "{warnings:?}");

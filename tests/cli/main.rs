@@ -543,6 +543,7 @@ fn presets_are_suggested_and_contradicted() {
         "{stderr}"
     );
     assert_eq!(stderr.matches("warning").count(), 1, "{stderr}");
+    assert!(stderr.contains("MiB for stage 2"), "{stderr}");
     let printed = |more: &[&str]| {
         let words = [&["train", &photos, "--print-config"], &SMALL[..], more].concat();
         let said = run(&words);
