@@ -2,13 +2,15 @@
 // Gradient of a field's first output with respect to position, by the chain rule, one point per invocation:
 //   s = σ'(u) ⊙ w₂,  a = W₁ᵀ s,  g = Jᵀ a  with J = ∂z/∂x = [I; ∂e/∂x].
 // a is kept: the hash table's gradient through g needs it (hash_grid_backward).
+// Where the network is one of matrices, the second form of this comes first, then `linear`, and this is left with g.
 #include "lib/prelude.glsl"
 #include "lib/hash_grid.glsl"
 #include "lib/field.glsl"
 #include "lib/look_up.glsl"
 
 layout(constant_id = 7) const uint STRAIGHT = 0;
-layout(constant_id = 8) const uint KEPT = 0;  // 1: field_forward has kept ∂e/∂x; 0: the table is looked up once more
+layout(constant_id = 8) const uint KEPT = 0;   // 1: field_forward has kept ∂e/∂x; 0: the table is looked up once more
+layout(constant_id = 9) const uint GIVEN = 0;  // 1: a is there
 #include "lib/tile.glsl"
 
 layout(push_constant, scalar) uniform Args {
@@ -20,16 +22,18 @@ layout(push_constant, scalar) uniform Args {
     F32s points;         // [3, n] region frame
     F32s inputs;         // [INPUTS, n] z, as field_forward left them
     F32s derivatives;    // [3, LEVELS·FEATURES, n] ∂e/∂x, where KEPT
+    F32sMut steepness;   // [HIDDEN, end - begin] s, of the form by matrices alone
     F32sMut slopes;      // [INPUTS, n] a
     F32sMut gradient;    // [3, n] g, per region unit
     uint n;
+    uint begin;          // the points of this launch
+    uint end;
 };
 
-void main() {
-    Item at_hand = item_of(0u, n);
-    uint point = at_hand.at;
-    load_input(inputs, n, at_hand);
-    float a[INPUTS];
+float a[INPUTS];
+
+void differentiate(Item point) {
+    load_input(inputs, n, point);
     [[unroll]] for (uint i = 0u; i < INPUTS; ++i) a[i] = 0.0;
     uint neurons = turns(HIDDEN, n);
     uint first_neuron = 0u;
@@ -42,8 +46,17 @@ void main() {
         }
         first_neuron += TILE;
     } while (first_neuron < neurons);
-    [[unroll]] for (uint i = 0u; i < INPUTS; ++i) slopes.at[i * n + point] = a[i];
+    [[unroll]] for (uint i = 0u; i < INPUTS; ++i) slopes.at[i * n + point.at] = a[i];
+}
 
+void main() {
+    Item at_hand = item_of(begin, end);
+    uint point = at_hand.at;
+    if (GIVEN == 0u) {
+        differentiate(at_hand);
+    } else if (KEPT != 0u) {
+        [[unroll]] for (uint i = 0u; i < INPUTS; ++i) a[i] = number_of(reading(slopes), i * n, at_hand);
+    }
     vec3 g = COORDINATES != 0u ? vector_at(reading(slopes), point, n) : vec3(0.0);
     if (KEPT != 0u) {
         [[unroll]] for (uint feature = 0u; feature < LEVELS * FEATURES; ++feature) {

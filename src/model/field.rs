@@ -65,6 +65,12 @@ impl FieldShape {
         }
     }
 
+    /// Whether this device computes the network by cooperative matrices.
+    fn by_matrices_on(&self, gpu: &Gpu) -> Result<bool> {
+        let form = Forms::of(gpu, self.hidden)?.linear;
+        Ok(form.by_matrices([self.inputs(), self.hidden]))
+    }
+
     /// Rows that only fields with a gradient need.
     fn with_gradient(&self, rows: u32) -> u32 {
         if self.gradient { rows } else { 0 }
@@ -100,6 +106,8 @@ struct GradientKernels {
     encoding: Option<Kernel<field_forward::Args>>,
     /// Order up to which it does.
     kept: u32,
+    /// s by matrices, from which the hidden layer has a before `gradient` begins.
+    by_matrices: Option<Kernel<field_gradient::Args>>,
     gradient: Kernel<field_gradient::Args>,
     tangent: Kernel<field_tangent::Args>,
     points: Kernel<field_point_backward::Args>,
@@ -167,10 +175,9 @@ impl Field {
         let tile = shape.hidden.min(8);
         let few_cores = gpu.info().few_cores;
         let form = Forms::of(gpu, shape.hidden)?.linear;
-        let size = [shape.inputs(), shape.hidden];
         // Always compensated: a gradient by finite differences would not survive float16.
-        let by_matrices = form.by_matrices(size);
-        let straight = u32::from(form.is_straight(size));
+        let by_matrices = shape.by_matrices_on(gpu)?;
+        let straight = u32::from(form.is_straight([shape.inputs(), shape.hidden]));
         let forward = field_forward::Shape {
             levels: grid_levels,
             features,
@@ -227,6 +234,19 @@ impl Field {
             Ok(kernel.labelled(label))
         };
         let network = format!("{label} network");
+        let gradient = field_gradient::Shape {
+            levels: grid_levels,
+            features,
+            hidden: shape.hidden,
+            coordinates,
+            softplus,
+            bias,
+            tile,
+            straight,
+            kept: kept.min(1),
+            given: u32::from(by_matrices),
+            half,
+        };
         // Where points without further heads have a launch of their own, all others have some.
         let with_heads = if few_cores { 2 } else { 1 };
         let by_chain_rule = match shape.gradient {
@@ -244,20 +264,11 @@ impl Field {
                     }
                 },
                 kept,
-                gradient: gpu
-                    .kernel(field_gradient::Shape {
-                        levels: grid_levels,
-                        features,
-                        hidden: shape.hidden,
-                        coordinates,
-                        softplus,
-                        bias,
-                        tile,
-                        straight,
-                        kept: kept.min(1),
-                        half,
-                    })?
-                    .labelled(label),
+                by_matrices: match by_matrices {
+                    true => Some(gpu.matrix_kernel(gradient, true)?.labelled(&network)),
+                    false => None,
+                },
+                gradient: gpu.kernel(gradient)?.labelled(label),
                 tangent: gpu
                     .kernel(field_tangent::Shape {
                         levels: grid_levels,
@@ -496,15 +507,42 @@ impl Field {
             points,
             inputs: buffers.inputs.ptr(),
             derivatives: out.derivatives().read(),
+            steepness: out.steepness(),
             slopes: out.slopes.ptr_mut(),
             gradient: out.gradient.ptr_mut(),
             n,
+            begin: 0,
+            end: n,
         };
-        let (flops, bytes) = self.derivative_work(1);
-        let flops = 2.0 * self.hidden_flops() + flops;
+        let (mut flops, bytes) = self.derivative_work(1);
         let bytes = 2.0 * self.row_bytes() + bytes;
+        match &self.kernels().by_matrices {
+            Some(kernel) => self.slopes_by_matrices(rec, params, kernel, args),
+            None => flops += 2.0 * self.hidden_flops(),
+        }
         let work = Work::items(u64::from(n)).flops(flops).bytes(bytes);
         rec.run(&self.kernels().gradient, work, args);
+    }
+
+    /// a = W₁ᵀ s, so many points at once as there is memory for their s.
+    fn slopes_by_matrices(
+        &self,
+        rec: &mut Recorder,
+        params: &Params,
+        kernel: &Kernel<field_gradient::Args>,
+        args: field_gradient::Args,
+    ) {
+        for begin in (0..args.n).step_by(AT_ONCE as usize) {
+            let end = args.n.min(begin + AT_ONCE);
+            let m = end - begin;
+            let work = work_of(kernel, m as usize, self.hidden_flops(), self.row_bytes());
+            rec.run(kernel, work, field_gradient::Args { begin, end, ..args });
+            let steepness = Planes::new(args.steepness.read(), m);
+            let inputs = Planes::new(args.inputs.offset(begin.into()), args.n);
+            let slopes = Planes::new(args.slopes.offset(begin.into()), args.n);
+            self.hidden_layer
+                .backward(rec, params, steepness, inputs, slopes, m);
+        }
     }
 
     /// Adds all parameter gradients, from `d_first [n_back]`, for the leading points the heads' gradients in `buffers.hidden`, and for a field

@@ -1,10 +1,10 @@
 //! A field's backward pass over more points than it takes at once, and over points with heads and without, is the sum of passes over
-//! fewer; straight-line code makes the same of a field as loops do, and derivatives that are kept the same as those looked up.
+//! fewer; straight-line code and matrices make the same of a field as loops do, and derivatives that are kept the same as those looked up.
 
 use crate::half_copy::cut;
 use crate::harness::assert_gradient;
 use neurodin::Result;
-use neurodin::gpu::{Gpu, GpuOptions, Ptr, PtrMut, Work};
+use neurodin::gpu::{Gpu, GpuOptions, Matrices, Ptr, PtrMut, Work};
 use neurodin::kernels::field_forward;
 use neurodin::model::{
     Field, FieldBuffers, FieldShape, Group, HashGrid, Init, Params, ParamsPlan, Scratch, layer_ways,
@@ -62,15 +62,12 @@ fn assert_valid(gpu: &Gpu) {
 
 fn field(gpu: &Gpu, shape: FieldShape) -> Result<(Field, Params)> {
     let mut plan = ParamsPlan::default();
-    let (hidden, inputs) = (SHAPE.hidden, SHAPE.inputs());
+    let (grid, hidden, inputs) = (shape.grid, shape.hidden, shape.inputs());
     let values = |of, n| (0..n).map(|i| 0.3 * noise(of, i)).collect::<Vec<f32>>();
     // Numbers that float16 has as well.
-    let features = values(
-        1,
-        (SHAPE.grid.entries() * u64::from(SHAPE.grid.features)) as usize,
-    );
+    let table = [grid.entries(), u64::from(grid.features)];
+    let features = values(1, (table[0] * table[1]) as usize);
     let features = features.iter().map(|&x| cut(x.into()) as f32).collect();
-    let table = [SHAPE.grid.entries(), u64::from(SHAPE.grid.features)];
     let table = plan.add(Group::Table, "table", &table, Init::Values(features));
     if shape.half {
         plan.keep_half(table);
@@ -111,7 +108,7 @@ fn backward(
     })?;
     let d_gradient = planes(6, 3, 0.1, range);
     gpu.upload(&buffers.slope().d_gradient, 0, &d_gradient)?;
-    let d_hidden = planes(7, SHAPE.hidden as usize, 1.0, with_heads);
+    let d_hidden = planes(7, field.shape.hidden as usize, 1.0, with_heads);
     let stride = u64::from(buffers.hidden.stride);
     for (row, plane) in d_hidden.chunks_exact(n_hidden.max(1) as usize).enumerate() {
         gpu.upload(&buffers.hidden.values, row as u64 * stride, plane)?;
@@ -340,5 +337,51 @@ fn straight_line_code_is_the_same_field() -> Result<()> {
     assert_gradients(&of_loops.1, &gradients(straight, &of_straight.1)?, &want);
     assert_valid(loops);
     assert_valid(straight);
+    Ok(())
+}
+
+/// Both where derivatives are kept and where they are looked up, on the way forward more points than have their memory at once.
+#[test]
+fn matrices_are_the_same_field() -> Result<()> {
+    let shape = FieldShape {
+        grid: HashGrid {
+            levels: 4,
+            features: 8,
+            ..SHAPE.grid
+        },
+        hidden: 40,
+        ..SHAPE
+    };
+    for many_cores in [false, true] {
+        let options = GpuOptions {
+            many_cores,
+            ..GpuOptions::default()
+        };
+        let by_matrices = open(GpuOptions {
+            matrices: Matrices::Compensated,
+            ..options.clone()
+        });
+        let by_matrices = match by_matrices {
+            Ok(gpu) => gpu,
+            Err(error) => {
+                println!("skipped: {error}");
+                return Ok(());
+            }
+        };
+        let loops = &open(options)?;
+        let (of_loops, of_matrices) = (field(loops, shape)?, field(&by_matrices, shape)?);
+        let range = 1..POINTS;
+        let want = backward(loops, &of_loops, range.clone())?;
+        let got = backward(&by_matrices, &of_matrices, range)?;
+        assert_gradient("what the points hear", &wide(&got), &wide(&want));
+        let want = gradients(loops, &of_loops.1)?;
+        assert_gradients(
+            &of_loops.1,
+            &gradients(&by_matrices, &of_matrices.1)?,
+            &want,
+        );
+        assert_valid(loops);
+        assert_valid(&by_matrices);
+    }
     Ok(())
 }

@@ -27,6 +27,7 @@ pub struct Slope {
     pub d_gradient: Buffer<f32>,                 // [3, n]
     pub(super) slopes: Buffer<f32>,              // [inputs, n] a
     pub(super) derivatives: Option<Buffer<f32>>, // [3 · order, hash features, n] of the encoding, where they are kept
+    steepness: Option<Buffer<f32>>, // [hidden, m] s of so many points at once, where the network is one of matrices
 }
 
 impl Slope {
@@ -34,17 +35,23 @@ impl Slope {
         let kept = self.derivatives.as_ref();
         kept.map_or(PtrMut::NULL, Buffer::ptr_mut)
     }
+
+    pub(super) fn steepness(&self) -> PtrMut<f32> {
+        let steepness = self.steepness.as_ref();
+        steepness.map_or(PtrMut::NULL, Buffer::ptr_mut)
+    }
 }
 
 impl FieldBuffers {
     /// Buffers for `n` points of fields of this shape.
     pub fn new(gpu: &Gpu, name: &str, shape: &FieldShape, n: u32, n_hidden: u32) -> Result<Self> {
-        let planes = |what: &str, channels: u32| {
+        let rows_of = |what: &str, channels: u32, points: u32| {
             gpu.scratch(
                 &format!("{name} {what}"),
-                u64::from(channels) * u64::from(n),
+                u64::from(channels) * u64::from(points),
             )
         };
+        let planes = |what, channels| rows_of(what, channels, n);
         let slope = match shape.gradient {
             true => Some(Slope {
                 gradient: planes("gradient", 3)?,
@@ -53,6 +60,10 @@ impl FieldBuffers {
                 derivatives: match shape.kept_on(gpu) {
                     0 => None,
                     order => Some(planes("derivatives", 3 * order * shape.grid.outputs())?),
+                },
+                steepness: match shape.by_matrices_on(gpu)? {
+                    true => Some(rows_of("steepness", shape.hidden, n.min(AT_ONCE))?),
+                    false => None,
                 },
             }),
             false => None,
