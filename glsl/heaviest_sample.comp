@@ -4,6 +4,7 @@
 // The heaviest sample of every ray and the two points behind it where bias correction asks the surface network (Wang et al. 2024, NeuRodin):
 //     k = argmax_i w_i (the first of equals),  P = o + (t_k + t_{k+1})/2 d,  queries P + eps d and P + offset d
 //     gate = [min_i sdf_i < 0] and, where need_opaque, [sum_i w_i > 0.999]; closed on rays outside the region
+// Rays whose gate is closed have no loss of their own: unless ask_all they all ask at the origin, whose look-ups cost next to nothing.
 // One subgroup per ray, its lanes share the samples; any subgroup size and any number of groups is right, rays are strided over.
 layout(push_constant, scalar) uniform Args {
     F32s weights;       // [n_rays, n_samples]
@@ -13,7 +14,7 @@ layout(push_constant, scalar) uniform Args {
     U32s ray_outside;   // [n_rays]
     F32s origins;       // [3, n_rays]
     F32s directions;    // [3, n_rays]
-    F32sMut queries;    // [3, 2 n_rays]: P + eps d, then P + offset d
+    F32sMut queries;    // [3, 2 n_rays]: P + eps d, then P + offset d, or the origin
     F32sMut gate;       // [n_rays] 0 or 1
     U32sMut heaviest;   // [n_rays] k
     uint n_rays;
@@ -21,6 +22,7 @@ layout(push_constant, scalar) uniform Args {
     float eps;          // region units
     float offset;       // region units
     uint need_opaque;   // 1: with a background the ray must be opaque
+    uint ask_all;       // 1: rays whose gate is closed ask, too
 };
 
 const float OPAQUE = 0.999;
@@ -54,8 +56,9 @@ void main() {
             float t = bin_midpoint(ray_span(near_far, n_rays, ray), edges.at[edge], edges.at[edge + 1u]);
             vec3 d = vector_at(directions, ray, n_rays);
             vec3 middle = vector_at(origins, ray, n_rays) + t * d;
-            set_vector(queries, ray, 2u * n_rays, middle + eps * d);
-            set_vector(queries, n_rays + ray, 2u * n_rays, middle + offset * d);
+            bool asks = open || ask_all != 0u;
+            set_vector(queries, ray, 2u * n_rays, asks ? middle + eps * d : vec3(0.0));
+            set_vector(queries, n_rays + ray, 2u * n_rays, asks ? middle + offset * d : vec3(0.0));
         }
     }
 }

@@ -79,6 +79,7 @@ void main() {
     if (whole != 0u && !becomes_whole) return;
     bool due = after_update != 0u && item() / 8u % SWEEP == step % SWEEP;
     bool all = everything != 0u || becomes_whole || due;
+    if (after_update != 0u && !all) return;  // nothing is marked then
 
     Level level = levels.at[l];
     uint now = clock.at[0];

@@ -156,6 +156,7 @@ impl Loss {
             eps: self.epsilon,
             offset: self.offset,
             need_opaque: self.need_opaque,
+            ask_all: self.published,
         };
         // Eight bytes and about as many operations a sample, shared by a subgroup's lanes.
         let share = 8.0 * f64::from(self.n_samples) / self.subgroup_size as f64;

@@ -498,6 +498,7 @@ fn bias_correction() {
                 eps: eps as f32,
                 offset: offset as f32,
                 need_opaque,
+                ask_all: 1,
             },
         );
         assert_close(

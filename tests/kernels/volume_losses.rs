@@ -86,7 +86,7 @@ fn heaviest_samples_and_bias_queries() {
             .collect();
         let outside: Vec<u32> = (0..n).map(|ray| u32::from(ray % 11 == 1)).collect();
         let (eps, offset) = (5e-4f32, 1e-2f32);
-        for need_opaque in [0, 1] {
+        for (need_opaque, ask_all) in [(0, 1), (1, 0), (1, 1)] {
             let queries = device.room("queries", 6 * n);
             let gate = device.room("gate", n);
             let heaviest = device.room("heaviest", n);
@@ -109,6 +109,7 @@ fn heaviest_samples_and_bias_queries() {
                     eps,
                     offset,
                     need_opaque,
+                    ask_all,
                 },
             );
             let row = |values: &[f64], ray: usize| values[ray * n_samples..][..n_samples].to_vec();
@@ -129,6 +130,9 @@ fn heaviest_samples_and_bias_queries() {
                 .collect();
             assert_eq!(device.take(&gate), want_gate);
             let point = |ray: usize, behind: f32| -> [f64; 3] {
+                if ask_all == 0 && !open(ray) {
+                    return [0.0; 3];
+                }
                 let t = |edge: usize| twin::distance(edges[ray][edge], near_far[ray]);
                 let t = (t(want[ray]) + t(want[ray] + 1)) / 2.0 + f64::from(behind);
                 std::array::from_fn(|j| origins[ray][j] + t * directions[ray][j])
