@@ -49,6 +49,8 @@ pub struct LazyTable {
     settled: Buffer<u32>,   // [slots / 32]
     stamps: Buffer<u32>,    // [slots / 4]
     mark: Kernel<table_mark::Args>,
+    /// The same, which settles what it marks.
+    mark_and_settle: Kernel<table_mark::Args>,
     settle: Sweep<table_settle::Args>,
     forget: Sweep<table_forget::Args>,
     update_whole: Sweep<table_update_whole::Args>,
@@ -88,6 +90,10 @@ const WORD: u64 = 32;
 /// Marking an entry costs about as much as updating so many parameters: a level that a step looks at more often than it has such
 /// parameters is better updated whole.
 const VISIT: u64 = 4;
+
+/// Settling entries where they are marked costs about as much, for each that is asked for, as going over so many words of marks: few
+/// points in a training step ask for what others have not.
+const WORDS_A_MARK: u64 = 4;
 
 /// Below it, β₂ to the power of as many steps as an entry may be left alone for is no longer a float32.
 const LEAST_BETA2: f64 = 0.75;
@@ -135,6 +141,13 @@ impl LazyTable {
             features,
             ..table_forget::Shape::default()
         };
+        let mark = table_mark::Shape {
+            levels: n_levels,
+            features,
+            settles: 0,
+            half,
+        };
+        let mark_and_settle = table_mark::Shape { settles: 1, ..mark };
         let levels = gpu.buffer("lazy levels", u64::from(n_levels))?;
         gpu.upload(&levels, 0, &rows)?;
         Ok(Some(LazyTable {
@@ -155,7 +168,8 @@ impl LazyTable {
             marks: gpu.buffer("table marks", slots / WORD)?,
             settled: gpu.buffer("table marks settled", slots / WORD)?,
             stamps: gpu.buffer("table stamps", slots / 4)?,
-            mark: gpu.kernel(table_mark::Shape { levels: n_levels })?,
+            mark: gpu.kernel(mark)?,
+            mark_and_settle: gpu.kernel(mark_and_settle)?,
             forget: Sweep::new(gpu.kernel(forget)?, WORD * u64::from(forget.turns)),
             update_whole: Sweep::new(
                 gpu.kernel(whole)?,
@@ -186,11 +200,28 @@ impl LazyTable {
             points,
             uses: self.uses.ptr_mut(),
             marks: self.marks.ptr_mut(),
+            rows: self.rows.ptr(),
+            clock: self.clock.ptr(),
+            settled: self.settled.ptr_mut(),
+            stamps: self.stamps.ptr_mut(),
+            table: params.values().at_mut(self.table),
+            halves: params.copy_of(self.table),
+            grads: params.d_value(self.table),
+            first_moment: params.first_moment().at_mut(self.table),
+            second_moment: params.second_moment().at_mut(self.table),
+            one_minus_beta1: self.one_minus_beta1,
+            one_minus_beta2: self.one_minus_beta2,
+            epsilon: self.epsilon,
             n,
         };
         let work = Work::items(u64::from(n)).slices(self.n_levels);
-        rec.run(&self.mark, work.flops(100.0).bytes(64.0), args);
-        self.settle(rec, params, Occasion::Touch);
+        let work = work.flops(100.0).bytes(64.0);
+        if 8 * u64::from(n) * WORDS_A_MARK <= self.most_entries / WORD {
+            rec.run(&self.mark_and_settle, work, args);
+        } else {
+            rec.run(&self.mark, work, args);
+            self.settle(rec, params, Occasion::Touch);
+        }
     }
 
     /// One AdamW step of the table, whose gradients are consumed now or when their entries are asked for again. `step` only has to differ
