@@ -36,6 +36,14 @@ struct ClockRow {
 };
 layout(buffer_reference, scalar) readonly buffer ClockRows { ClockRow at[]; };
 
+// A row, whose eight numbers lanes read from all over: in pairs, half as many accesses.
+ClockRow row_of(ClockRows rows, uint then) {
+    F32s numbers = F32s(uvec2(rows));
+    vec2 pairs[4];
+    [[unroll]] for (uint k = 0u; k < 4u; ++k) pairs[k] = pair_at(numbers, 8u * then + 2u * k);
+    return ClockRow(Lag(pairs[0].x, pairs[0].y, pairs[1].x, pairs[1].y, pairs[2].x), pairs[2].y, pairs[3].x, pairs[3].y);
+}
+
 struct LevelUse {
     uint marked;  // entries, in this step
     uint whole;   // non-zero: steps for which it is updated whole

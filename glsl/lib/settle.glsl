@@ -30,7 +30,7 @@ void settle(uint entry, uint slot, uint now) {
     uint stamp = stamp_in(of_four, slot);
     if (stamp == now) return;
     uint next = (stamp + 1u) % READINGS;
-    ClockRow row = rows.at[next];
+    ClockRow row = row_of(rows, next);
     Rates rates = Rates(row.rate, row.decay, row.correction, one_minus_beta1, one_minus_beta2, epsilon);
     if (next == now) row.lag = NO_LAG;
     // (Written out: a loop around a loop stays one, and what it indexes goes through memory lane by lane.)
