@@ -82,6 +82,24 @@ fn field(gpu: &Gpu, shape: FieldShape) -> Result<(Field, Params)> {
     Ok((field, plan.build(gpu, 1, true)?))
 }
 
+/// The first output's gradient at these points, none of which has heads.
+fn slope(
+    gpu: &Gpu,
+    (field, params): &(Field, Params),
+    range: std::ops::Range<usize>,
+) -> Result<Vec<f32>> {
+    let buffers = FieldBuffers::new(gpu, "slope", &field.shape, range.len() as u32, 0)?;
+    let points = gpu.buffer("points", 3 * range.len() as u64)?;
+    gpu.upload(&points, 0, &planes(4, 3, 0.9, range))?;
+    gpu.submit("slope", |rec| {
+        field.encode(rec, params, points.ptr(), &buffers);
+        field.gradient(rec, params, points.ptr(), &buffers);
+        Ok(())
+    })?;
+    let gradient = &buffers.slope().gradient;
+    gpu.download(gradient, 0, gradient.len())
+}
+
 /// Adds the gradients of these points to `params`' and returns what the points hear.
 fn backward(
     gpu: &Gpu,
@@ -371,6 +389,9 @@ fn matrices_are_the_same_field() -> Result<()> {
         let loops = &open(options)?;
         let (of_loops, of_matrices) = (field(loops, shape)?, field(&by_matrices, shape)?);
         let range = 1..POINTS;
+        let want = slope(loops, &of_loops, range.clone())?;
+        let got = slope(&by_matrices, &of_matrices, range.clone())?;
+        assert_gradient("the first output's gradient", &wide(&got), &wide(&want));
         let want = backward(loops, &of_loops, range.clone())?;
         let got = backward(&by_matrices, &of_matrices, range)?;
         assert_gradient("what the points hear", &wide(&got), &wide(&want));
