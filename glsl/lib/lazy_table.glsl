@@ -51,8 +51,8 @@ struct LevelUse {
 layout(buffer_reference, scalar) readonly buffer LevelUses { LevelUse at[]; };
 layout(buffer_reference, scalar) buffer LevelUsesMut { LevelUse at[]; };
 
-// Marks (a bit each) and stamps (a byte each) are kept by slots: entries, but every level begins with a word of marks of its own.
-uint first_slot(Level level, uint l) { return (level.offset / 32u + l) * 32u; }
+// Marks (a bit each) and stamps (a byte each) are kept by slots: entries, but every level begins with a pair of words of marks of its own.
+uint first_slot(Level level, uint l) { return (level.offset / 64u + l) * 64u; }
 
 uint stamp_in(uint word, uint slot) { return (word >> (8u * (slot & 3u))) & 255u; }
 

@@ -59,6 +59,13 @@ void set_pair(F32sMut p, uint i, vec2 v) {
     p.at[i] = v.x;
     p.at[i + 1u] = v.y;
 }
+
+uvec2 words_at(U32s p, uint i) { return uvec2(p.at[i], p.at[i + 1u]); }
+
+void set_words(U32sMut p, uint i, uvec2 v) {
+    p.at[i] = v.x;
+    p.at[i + 1u] = v.y;
+}
 #else
 layout(buffer_reference, scalar, buffer_reference_align = 8) readonly buffer U64s { uint64_t at[]; };
 layout(buffer_reference, scalar, buffer_reference_align = 8) buffer U64sMut { uint64_t at[]; };
@@ -66,6 +73,10 @@ layout(buffer_reference, scalar, buffer_reference_align = 8) buffer U64sMut { ui
 vec2 pair_at(F32s p, uint i) { return uintBitsToFloat(unpackUint2x32(U64s(uvec2(p)).at[i >> 1u])); }
 
 void set_pair(F32sMut p, uint i, vec2 v) { U64sMut(uvec2(p)).at[i >> 1u] = packUint2x32(floatBitsToUint(v)); }
+
+uvec2 words_at(U32s p, uint i) { return unpackUint2x32(U64s(uvec2(p)).at[i >> 1u]); }
+
+void set_words(U32sMut p, uint i, uvec2 v) { U64sMut(uvec2(p)).at[i >> 1u] = packUint2x32(v); }
 #endif
 
 // Index of this invocation's workgroup among the launch's, which stand in rows: one dimension of a grid ends at 65535 workgroups. For

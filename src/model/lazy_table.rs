@@ -85,8 +85,9 @@ impl<A> Sweep<A> {
 
 /// Readings of the clock.
 const READINGS: u64 = 256;
-/// Marks in a word.
+/// Marks in a word, and in two.
 const WORD: u64 = 32;
+const PAIR: u64 = 2 * WORD;
 /// Marking an entry costs about as much as updating so many parameters: a level that a step looks at more often than it has such
 /// parameters is better updated whole.
 const VISIT: u64 = 4;
@@ -123,12 +124,12 @@ impl LazyTable {
         }
         let n_levels = rows.len() as u32;
         let end = u64::from(last.offset) + u64::from(last.entries);
-        let slots = (end / WORD + u64::from(n_levels) + 1) * WORD;
+        let slots = (end / PAIR + u64::from(n_levels) + 1) * PAIR;
         // Counted in bytes, settling an entry by itself is worth it for up to 65 % of them. A processor pays for finding it, too, whatever
         // its features (tools/runs/throughput.md).
         let (strip, most) = match gpu.info().few_cores {
-            true => (32, 0.03 + 0.0275 * features as f32),
-            false => (2, 0.65),
+            true => (16, 0.03 + 0.0275 * features as f32),
+            false => (1, 0.65),
         };
         let half = u32::from(half);
         let whole = table_update_whole::Shape {
@@ -183,7 +184,7 @@ impl LazyTable {
                     strip,
                     half,
                 })?,
-                WORD * u64::from(strip),
+                PAIR * u64::from(strip),
             ),
         }))
     }
