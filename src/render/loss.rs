@@ -8,7 +8,9 @@ use super::tangent::Tangent;
 use crate::Result;
 use crate::config::{BiasReduction, Config};
 use crate::gpu::{Buffer, Gpu, Kernel, Ptr, Recorder, Work};
-use crate::kernels::{LossTerm, bias_correction, color_loss, heaviest_sample, sum_losses};
+use crate::kernels::{
+    LossTerm, bias_correction, color_loss, heaviest_sample, loss_shares, sum_losses,
+};
 use crate::model::{FieldBuffers, Model, Scratch, Surface};
 
 /// Names of the summed terms, in order; the total of all but the last three, which are figures for the log, follows as the last number.
@@ -52,9 +54,12 @@ pub struct Loss {
     pub eikonal_scale: f32,
     pub interlevel_scale: f32,
     terms: Buffer<LossTerm>,
+    shares: Buffer<f32>, // [TERMS, n_shares] of their sums
+    n_shares: u32,
     color_loss: Kernel<color_loss::Args>,
     heaviest_sample: Kernel<heaviest_sample::Args>,
     bias_correction: Kernel<bias_correction::Args>,
+    loss_shares: Kernel<loss_shares::Args>,
     sum_losses: Kernel<sum_losses::Args>,
     epsilon: f32,
     offset: f32,
@@ -76,6 +81,9 @@ impl Loss {
         let (n_rays, n_samples) = (config.rays, config.sampling.samples);
         let n = u64::from(n_rays);
         let bias = &config.loss.bias;
+        let published = u32::from(bias.reduction == BiasReduction::Published);
+        let of_share = loss_shares::Shape::default();
+        let n_shares = (n_rays * n_samples).div_ceil(of_share.values);
         let loss = Loss {
             d_color: gpu.scratch("d_color", 3 * n)?,
             sums: gpu.buffer("losses", TERMS.len() as u64 + 1)?,
@@ -103,13 +111,16 @@ impl Loss {
             eikonal_scale: config.loss.eikonal as f32 / (n_rays * n_samples) as f32,
             interlevel_scale: config.loss.interlevel as f32 / n_rays as f32,
             terms: gpu.buffer("loss terms", TERMS.len() as u64)?,
+            shares: gpu.scratch("loss shares", TERMS.len() as u64 * u64::from(n_shares))?,
+            n_shares,
             color_loss: gpu.kernel(color_loss::Shape::default())?,
             heaviest_sample: gpu.kernel(heaviest_sample::Shape::default())?,
-            bias_correction: gpu.kernel(bias_correction::Shape::default())?,
+            bias_correction: gpu.kernel(bias_correction::Shape { published })?,
+            loss_shares: gpu.kernel(of_share)?,
             sum_losses: gpu.kernel(sum_losses::Shape::default())?,
             epsilon: bias.epsilon as f32,
             offset: bias.offset as f32,
-            published: u32::from(bias.reduction == BiasReduction::Published),
+            published,
             need_opaque: u32::from(!config.surface.inside_out),
             n_rays,
             n_samples,
@@ -189,11 +200,10 @@ impl Loss {
             n_rays: self.n_rays,
             eps: self.epsilon,
             scale: weight / self.n_rays as f32,
-            published: self.published,
         };
         rec.run(
             &self.bias_correction,
-            Work::items(1).bytes(20.0 * f64::from(self.n_rays)),
+            Work::items(self.n_rays.into()).bytes(20.0),
             args,
         );
         model.surface.probes.backward(
@@ -260,16 +270,25 @@ impl Loss {
     /// Sums all terms in a fixed order, into `self.sums`, and flags a sum that is not finite.
     pub fn sum(&self, rec: &mut Recorder) {
         rec.fill(&self.bad_step, 0..1, 0);
-        let args = sum_losses::Args {
+        let n_terms = TERMS.len() as u32;
+        let args = loss_shares::Args {
             terms: self.terms.ptr(),
-            losses: self.sums.ptr_mut(),
-            bad_step: self.bad_step.ptr_mut(),
-            n_terms: TERMS.len() as u32,
+            shares: self.shares.ptr_mut(),
+            n_shares: self.n_shares,
         };
         rec.run(
-            &self.sum_losses,
-            Work::items(1).bytes(4.0 * f64::from(self.n_rays * self.n_samples)),
+            &self.loss_shares,
+            Work::groups(u64::from(self.n_shares)).slices(n_terms),
             args,
         );
+        let args = sum_losses::Args {
+            terms: self.terms.ptr(),
+            shares: self.shares.ptr(),
+            losses: self.sums.ptr_mut(),
+            bad_step: self.bad_step.ptr_mut(),
+            n_terms,
+            n_shares: self.n_shares,
+        };
+        rec.run(&self.sum_losses, Work::groups(1), args);
     }
 }

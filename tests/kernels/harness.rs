@@ -71,10 +71,15 @@ impl Device {
 
     /// Runs one kernel over `items` invocations, waits for it, and looks at the guard words and at what the validation layer says.
     pub fn run<S: KernelShape>(&self, shape: S, items: usize, args: S::Args) {
+        self.run_work(shape, Work::items(items as u64), args);
+    }
+
+    /// The same of any work.
+    pub fn run_work<S: KernelShape>(&self, shape: S, work: Work, args: S::Args) {
         let _turn = self.turn();
         let kernel = self.gpu.kernel(shape).expect("the kernel can be built");
         let ticket = self.gpu.submit("test", |rec| {
-            rec.run(&kernel, Work::items(items as u64), args);
+            rec.run(&kernel, work, args);
             Ok(())
         });
         self.gpu.wait(ticket.expect("submitted")).expect("finished");

@@ -2,6 +2,7 @@
 
 use crate::harness::*;
 use crate::volume_twin::{self as twin, ProposalRay};
+use neurodin::gpu::Work;
 use neurodin::kernels;
 
 #[test]
@@ -163,8 +164,10 @@ pub fn run_bias_correction(
     let n = gate.len();
     let (loss, d_query_sdf) = (device.room("loss", n), device.room("d_query_sdf", n));
     device.run(
-        kernels::bias_correction::Shape::default(),
-        1,
+        kernels::bias_correction::Shape {
+            published: u32::from(published),
+        },
+        n,
         kernels::bias_correction::Args {
             query_sdf: device.put("query_sdf", &[near, behind].concat()).ptr(),
             gate: device.put("gate", gate).ptr(),
@@ -173,7 +176,6 @@ pub fn run_bias_correction(
             n_rays: n as u32,
             eps: eps as f32,
             scale: scale as f32,
-            published: u32::from(published),
         },
     );
     (device.take(&loss), device.take(&d_query_sdf))
@@ -326,19 +328,35 @@ fn loss_sums() {
     };
     let terms: Vec<_> = buffers.iter().zip(1..).map(term).collect();
     let table = device.table("terms", &terms);
-    let (losses, bad_step) = (
+    let of_share = kernels::loss_shares::Shape::default();
+    let n_shares = 5000u32.div_ceil(of_share.values);
+    assert!(n_shares > 1, "the longest array comes in shares");
+    let (losses, shares, bad_step) = (
         device.room("losses", terms.len() + 1),
+        device.room("shares", terms.len() * n_shares as usize),
         device.table("bad_step", &[0]),
     );
+    let n_terms = terms.len() as u32;
     let sum = || {
+        device.run_work(
+            of_share,
+            Work::groups(n_shares.into()).slices(n_terms),
+            kernels::loss_shares::Args {
+                terms: table.ptr(),
+                shares: shares.ptr_mut(),
+                n_shares,
+            },
+        );
         device.run(
             kernels::sum_losses::Shape::default(),
             1,
             kernels::sum_losses::Args {
                 terms: table.ptr(),
+                shares: shares.ptr(),
                 losses: losses.ptr_mut(),
                 bad_step: bad_step.ptr_mut(),
-                n_terms: terms.len() as u32,
+                n_terms,
+                n_shares,
             },
         );
         device.take(&losses)
