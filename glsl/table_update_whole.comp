@@ -39,6 +39,7 @@ void main() {
     U32sMut halves = halves;
     SumsMut grads = grads;
     uint n_pairs = level.entries * FEATURES / 2u;  // levels have an even number of entries, and more than a subgroup has lanes
+    if (group() * LOCAL_SIZE * TURNS >= n_pairs) return;  // the launch is as long as the largest level
     bool bad = bad_step.at[0] != 0u;
     Rates rates = Rates(rate, decay, correction, one_minus_beta1, one_minus_beta2, epsilon);
     uint first = first_of_subgroup(TURNS), row = level.offset * FEATURES;
