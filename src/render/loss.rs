@@ -84,6 +84,11 @@ impl Loss {
         let published = u32::from(bias.reduction == BiasReduction::Published);
         let of_share = loss_shares::Shape::default();
         let n_shares = (n_rays * n_samples).div_ceil(of_share.values);
+        let sum_losses = gpu.kernel(sum_losses::Shape::default())?;
+        assert!(
+            TERMS.len() <= sum_losses.local_size() as usize,
+            "an invocation for each term"
+        );
         let loss = Loss {
             d_color: gpu.scratch("d_color", 3 * n)?,
             sums: gpu.buffer("losses", TERMS.len() as u64 + 1)?,
@@ -117,7 +122,7 @@ impl Loss {
             heaviest_sample: gpu.kernel(heaviest_sample::Shape::default())?,
             bias_correction: gpu.kernel(bias_correction::Shape { published })?,
             loss_shares: gpu.kernel(of_share)?,
-            sum_losses: gpu.kernel(sum_losses::Shape::default())?,
+            sum_losses,
             epsilon: bias.epsilon as f32,
             offset: bias.offset as f32,
             published,
@@ -276,9 +281,12 @@ impl Loss {
             shares: self.shares.ptr_mut(),
             n_shares: self.n_shares,
         };
+        // Of all that is read, the samples' arrays are nearly everything; there is always one.
+        let read = 4.0 * f64::from(self.n_rays * self.n_samples);
+        let work = Work::groups(u64::from(self.n_shares)).slices(n_terms);
         rec.run(
             &self.loss_shares,
-            Work::groups(u64::from(self.n_shares)).slices(n_terms),
+            work.bytes(read / f64::from(self.n_shares * n_terms)),
             args,
         );
         let args = sum_losses::Args {
