@@ -13,6 +13,7 @@ layout(push_constant, scalar) uniform Args {
 };
 
 void main() {
+    if (group() >= n_shares) return;  // rows of a launch are equally long
     LossTerm term = terms.at[slice()];
     uint first = group() * VALUES, end = min(first + VALUES, term.count);
     float sum = 0.0;
